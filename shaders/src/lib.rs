@@ -1,0 +1,97 @@
+//! This crate owns the WGSL text of every kernel, the table that lists them, and the parameter structs they read.
+//! It does not know wgpu, plans or the model.
+//!
+//! One op has one name, used by the kernel file (`<op>/<direction>.wgsl`), the CPU reference, the plan step, the test
+//! and the label in profiles and errors. Conventions that hold for every kernel:
+//!
+//! - Matrices are row-major. A *row* is one ray (or one point on a ray); `rows = groups · rows_per_group`, and the rows of a
+//!   group belong to one image, number `first_group + row / rows_per_group`.
+//! - A linear layer is **one** buffer: the weight `[out, in]` row-major, then the bias `[out]`. That is also what the
+//!   hypernetwork emits, so plain and per-instance layers are the same op. An affine layer norm is `gamma` then `beta`.
+//! - A kernel OVERWRITES its outputs, or ACCUMULATES where its parameter `accumulate` is 1.
+//! - Sums over rows go to partial sums first and through `sum/forward` after: no atomics, so a run repeats bit for bit.
+
+mod params;
+mod table;
+
+pub use params::*;
+pub use table::*;
+
+/// The scalar type of a buffer's elements.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Element {
+    /// 32-bit float.
+    F32,
+    /// 32-bit unsigned integer.
+    U32,
+}
+
+/// One storage buffer that a kernel reads or writes, identified by its name in the WGSL text.
+#[derive(Clone, Copy, Debug)]
+pub struct Binding {
+    /// Name of the WGSL variable.
+    pub name: &'static str,
+    /// Element type of the array behind it.
+    pub element: Element,
+    /// True for `var<storage, read_write>`.
+    pub written: bool,
+}
+
+/// What a faster form of a kernel needs before it may replace the plain one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Requirement {
+    /// Nothing: any adapter, any size.
+    Nothing,
+    /// `in_features` and `out_features` are multiples of 4 (the buffers are read as `vec4<f32>`).
+    FeaturesMultipleOf4,
+}
+
+/// One WGSL text that computes a kernel; every kernel has at least one, and its plain form runs everywhere.
+#[derive(Clone, Copy, Debug)]
+pub struct Variant {
+    /// File name without the extension, unique within the kernel.
+    pub name: &'static str,
+    /// The WGSL text of the file.
+    pub text: &'static str,
+    /// Elements of the step's extent that one workgroup covers, per dimension.
+    pub tile: [u32; 3],
+    /// When it may be used.
+    pub requires: Requirement,
+}
+
+/// One kernel: an op in one direction.
+#[derive(Debug)]
+pub struct Kernel {
+    /// Name of the op: the directory.
+    pub op: &'static str,
+    /// Direction: the file.
+    pub direction: &'static str,
+    /// `op/direction`, the label everywhere.
+    pub name: &'static str,
+    /// The storage buffers, inputs first.
+    pub bindings: &'static [Binding],
+    /// The Rust mirror of the WGSL `Params`.
+    pub params: &'static ParamsLayout,
+    /// Plain form first, then forms that are preferred where their requirement holds.
+    pub variants: &'static [Variant],
+}
+
+impl Kernel {
+    /// The complete WGSL source of one variant: shared functions, then the kernel.
+    pub fn source(&self, variant: &Variant) -> String {
+        format!("{COMMON}\n{}", variant.text)
+    }
+
+    /// The binding called `name`.
+    pub fn binding(&self, name: &str) -> Option<&'static Binding> {
+        self.bindings.iter().find(|binding| binding.name == name)
+    }
+}
+
+/// The kernel called `name`, as `op/direction`.
+pub fn find(name: &str) -> Option<&'static Kernel> {
+    TABLE.iter().copied().find(|kernel| kernel.name == name)
+}
+
+/// Functions that every kernel can call.
+pub const COMMON: &str = include_str!("../common/index.wgsl");

@@ -1,0 +1,180 @@
+//! The table of kernels. A test without a GPU walks it and fails where a kernel, reference, step or test is missing.
+
+use crate::params::*;
+use crate::{Binding, Element, Kernel, Requirement, Variant};
+
+macro_rules! element {
+    (f32) => {
+        Element::F32
+    };
+    (u32) => {
+        Element::U32
+    };
+}
+
+macro_rules! table {
+    ($(
+        $(#[$doc:meta])*
+        $id:ident = $op:literal / $direction:literal, $params:ident, tile $tile:expr,
+        ($($in:ident: $in_ty:ident),*) -> ($($out:ident: $out_ty:ident),*)
+        $(, or $variant:literal tile $variant_tile:expr, when $requires:ident)*;
+    )*) => {
+        $(
+            $(#[$doc])*
+            pub static $id: Kernel = Kernel {
+                op: $op,
+                direction: $direction,
+                name: concat!($op, "/", $direction),
+                bindings: &[
+                    $(Binding { name: stringify!($in), element: element!($in_ty), written: false },)*
+                    $(Binding { name: stringify!($out), element: element!($out_ty), written: true },)*
+                ],
+                params: &$params::LAYOUT,
+                variants: &[
+                    Variant {
+                        name: $direction,
+                        text: include_str!(concat!("../", $op, "/", $direction, ".wgsl")),
+                        tile: $tile,
+                        requires: Requirement::Nothing,
+                    },
+                    $(Variant {
+                        name: $variant,
+                        text: include_str!(concat!("../", $op, "/", $variant, ".wgsl")),
+                        tile: $variant_tile,
+                        requires: Requirement::$requires,
+                    },)*
+                ],
+            };
+        )*
+        /// Every kernel, in the order of the forward pass.
+        pub static TABLE: &[&Kernel] = &[$(&$id),*];
+    };
+}
+
+/// One invocation per element, 64 to a workgroup.
+const FLAT: [u32; 3] = [64, 1, 1];
+
+table! {
+    /// `R = Rx(θ1)·Ry(θ2)·Rz(θ3)`, `world_from_camera = [R | t]` (spec 1). `pose6 [B,6]` → `world_from_camera [B,12]`, 3×4 row-major.
+    POSE_FORWARD = "pose"/"forward", PoseParams, tile FLAT,
+        (pose6: f32) -> (world_from_camera: f32);
+    /// Chain rule from `d_world_from_camera [B,12]` to the six numbers `d_pose6 [B,6]`.
+    POSE_BACKWARD = "pose"/"backward", PoseParams, tile FLAT,
+        (pose6: f32, d_world_from_camera: f32) -> (d_pose6: f32);
+    /// `q = ((u-cx)/fx, (v-cy)/fy, 1)`, `direction = normalize(R q)`, `origin = t + R (z0 q)`.
+    /// `world_from_camera [images,12]`, `intrinsics [images,4]` (fx, fy, cx, cy), `uv [rows,2]`, `z0 [rows]` → `origin, direction [rows,3]`.
+    RAYS_FORWARD = "rays"/"forward", RowsParams, tile FLAT,
+        (world_from_camera: f32, intrinsics: f32, uv: f32, z0: f32) -> (origin: f32, direction: f32);
+    /// Sums each image's rows into `partial [groups, chunks, 12]`, the gradient of `world_from_camera`; `d_origin, d_direction [rows,3]`.
+    RAYS_BACKWARD = "rays"/"backward", RowsParams, tile FLAT,
+        (world_from_camera: f32, intrinsics: f32, uv: f32, z0: f32, d_origin: f32, d_direction: f32) -> (partial: f32);
+    /// Copies a tile's rows out of the whole batch: `whole [images · rows_per_image, columns]` → `part [rows, columns]`.
+    TILE_GATHER = "tile"/"gather", TileParams, tile FLAT,
+        (whole: f32) -> (part: f32);
+    /// Copies a tile's rows into the whole batch; other rows stay.
+    TILE_SCATTER = "tile"/"scatter", TileParams, tile FLAT,
+        (part: f32) -> (whole: f32);
+    /// `z[b] = codes[index[b]]`: `codes [instances, latent]`, `index [B]` → `z [B, latent]`.
+    EMBEDDING_FORWARD = "embedding"/"forward", EmbeddingParams, tile FLAT,
+        (codes: f32, index: u32) -> (z: f32);
+    /// `d_codes[n] = Σ_{b: index[b]=n} d_z[b]`, zero for codes outside the batch.
+    EMBEDDING_BACKWARD = "embedding"/"backward", EmbeddingParams, tile FLAT,
+        (index: u32, d_z: f32) -> (d_codes: f32);
+    /// `y[r,o] (+)= Σ_i W[o,i] x[r,i] + b[o]`, weights at `slots[first_group + r / rows_per_group] · weight_stride`.
+    /// Extent: rows of a group × out_features × groups.
+    LINEAR_FORWARD = "linear"/"forward", LinearParams, tile [64, 8, 1],
+        (x: f32, weights: f32, slots: u32) -> (y: f32);
+    /// `d_x[r,i] (+)= Σ_{o=first_out}^{end_out-1} W[o,i] d_y[r,o]`. Extent: rows of a group × in_features × groups.
+    LINEAR_BACKWARD_INPUT = "linear"/"backward_input", LinearParams, tile [64, 8, 1],
+        (d_y: f32, weights: f32, slots: u32) -> (d_x: f32);
+    /// `partial[g,c] (+)= (Σ_r d_y[r,o] x[r,i], Σ_r d_y[r,o])` over the rows of chunk `c`: weight, then bias; `[groups, chunks, out·in + out]`.
+    /// Extent: out_features × in_features × (groups · chunks). (Independent of `slots`: group `g` writes set `g`.)
+    LINEAR_BACKWARD_WEIGHT = "linear"/"backward_weight", LinearParams, tile [8, 64, 1],
+        (x: f32, d_y: f32) -> (partial: f32);
+    /// `y = relu(gamma (x - mean) rstd + beta)`, `rstd = 1/√(var + 1e-5)`, biased variance.
+    /// `x [rows, features]`, `affine [2, features]` → `y`, `stats [rows,2]` = (mean, rstd). Extent: rows.
+    LAYER_NORM_RELU_FORWARD = "layer_norm_relu"/"forward", LayerNormParams, tile FLAT,
+        (x: f32, affine: f32) -> (y: f32, stats: f32);
+    /// Gradient to `x`: with `e = gamma · d_y` where `y > 0`, else 0: `d_x = rstd (e - mean(e) - x̂ mean(e x̂))`. Extent: rows.
+    LAYER_NORM_RELU_BACKWARD_INPUT = "layer_norm_relu"/"backward_input", LayerNormParams, tile FLAT,
+        (x: f32, stats: f32, affine: f32, d_y: f32) -> (d_x: f32);
+    /// Sums of `d_y x̂` and `d_y` (where `y > 0`) over the rows of each chunk: `partial [chunks, 2, features]`. Extent: features × chunks.
+    LAYER_NORM_RELU_BACKWARD_AFFINE = "layer_norm_relu"/"backward_affine", LayerNormParams, tile [64, 1, 1],
+        (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32);
+    /// Gates in the order i, f, g, o: `c = σ(f) c_prev + σ(i) tanh(g)`, `h = σ(o) tanh(c)`.
+    /// `gates [rows, 4·hidden]` before activation, `c_prev [rows, hidden]` → `h, c [rows, hidden]`. Extent: rows · hidden.
+    LSTM_CELL_FORWARD = "lstm_cell"/"forward", LstmParams, tile FLAT,
+        (gates: f32, c_prev: f32) -> (h: f32, c: f32);
+    /// Clamps `d_h` to ±10, then back to the gates (before activation) and to `c_prev`; `d_c` arrives from the next step.
+    LSTM_CELL_BACKWARD = "lstm_cell"/"backward", LstmParams, tile FLAT,
+        (gates: f32, c_prev: f32, c: f32, d_h: f32, d_c: f32) -> (d_gates: f32, d_c_prev: f32);
+    /// `x_next = x + direction · step`; `x, direction, x_next [rows,3]`, `step [rows]`. Extent: rows.
+    ADVANCE_FORWARD = "advance"/"forward", PointParams, tile FLAT,
+        (x: f32, direction: f32, step: f32) -> (x_next: f32);
+    /// `d_step = d_x_next · direction` (overwrites), `d_direction (+)= d_x_next step`. (`d_x = d_x_next`: the caller keeps the buffer.)
+    ADVANCE_BACKWARD = "advance"/"backward", PointParams, tile FLAT,
+        (direction: f32, step: f32, d_x_next: f32) -> (d_step: f32, d_direction: f32);
+    /// `phi[r] (+)= density[r] feature[r]`; `density [rows]`, `feature, phi [rows, features]`. Extent: rows · features.
+    DENSITY_SUM_FORWARD = "density_sum"/"forward", PointParams, tile FLAT,
+        (density: f32, feature: f32) -> (phi: f32);
+    /// `d_density[r] = ⟨d_phi[r], feature[r]⟩`, `d_feature[r] = density[r] d_phi[r]`; both overwrite. Extent: rows.
+    DENSITY_SUM_BACKWARD = "density_sum"/"backward", PointParams, tile FLAT,
+        (density: f32, feature: f32, d_phi: f32) -> (d_density: f32, d_feature: f32);
+    /// `depth = R[:,2] · (x - t)`, z in the camera frame: `x [rows,3]` → `depth [rows]`. Extent: rows.
+    DEPTH_FORWARD = "depth"/"forward", RowsParams, tile FLAT,
+        (world_from_camera: f32, x: f32) -> (depth: f32);
+    /// Gradient of `scale · Σ min(depth, 0)²` to `d_x [rows,3]`, overwrites. Extent: rows.
+    DEPTH_BACKWARD = "depth"/"backward", RowsParams, tile FLAT,
+        (world_from_camera: f32, depth: f32) -> (d_x: f32);
+    /// `partial[c] = scale · Σ min(depth, 0)²` over chunk `c`. Extent: chunks.
+    DEPTH_LOSS_FORWARD = "depth_loss"/"forward", TermParams, tile FLAT,
+        (depth: f32) -> (partial: f32);
+    /// `partial[c] = scale · Σ z²` over chunk `c`. Extent: chunks.
+    LATENT_LOSS_FORWARD = "latent_loss"/"forward", TermParams, tile FLAT,
+        (z: f32) -> (partial: f32);
+    /// `d_z += 2 scale z`: ACCUMULATES onto the gradient that came through the hypernetwork. Extent: count.
+    LATENT_LOSS_BACKWARD = "latent_loss"/"backward", TermParams, tile FLAT,
+        (z: f32) -> (d_z: f32);
+    /// Number of target values that are not exactly 1: `target [images · rows_per_group, 3]` → `partial [groups, chunks]`. Extent: groups · chunks.
+    IMAGE_LOSS_COUNT = "image_loss"/"count", ImageLossParams, tile FLAT,
+        (target_rgb: f32) -> (partial: f32);
+    /// Sum of `|e|` or `e²` over the rows of a chunk, times the normaliser: `1 / values_per_image` (MAE, MSE) or
+    /// `1 / (1 + count[image])` (norm_l1, norm_l2). `partial [groups, chunks]`. Extent: groups · chunks.
+    IMAGE_LOSS_FORWARD = "image_loss"/"forward", ImageLossParams, tile FLAT,
+        (rgb: f32, target_rgb: f32, count: f32) -> (partial: f32);
+    /// `d_rgb = scale · normaliser · sign(e)` or `· 2e`; `sign(0) = 0`. Extent: values.
+    IMAGE_LOSS_BACKWARD = "image_loss"/"backward", ImageLossParams, tile FLAT,
+        (rgb: f32, target_rgb: f32, count: f32) -> (d_rgb: f32);
+    /// To [0,1], YIQ luma `0.299 R + 0.587 G + 0.114 B`, 2×2 average: `rgb [images, height, width, 3]` → `luma [images, h2, w2]`,
+    /// `h2 = height / 2`, `w2 = width / 2` rounded down. Extent: images · h2 · w2, as for the next ones.
+    GMSD_POOL = "gmsd"/"pool", GmsdParams, tile FLAT,
+        (rgb: f32) -> (luma: f32);
+    /// Prewitt magnitudes `a, b` (3×3 / 3, zero padding) of both images, `quality = (2ab + c)/(a² + b² + c)`, `c = 170/255²`.
+    GMSD_SIMILARITY = "gmsd"/"similarity", GmsdParams, tile FLAT,
+        (luma: f32, target_luma: f32) -> (quality: f32);
+    /// `Σ (q - 1)` and `Σ (q - 1)²` per chunk: `partial [images, chunks, 2]`. Extent: images · chunks.
+    GMSD_MOMENTS = "gmsd"/"moments", GmsdParams, tile FLAT,
+        (quality: f32) -> (partial: f32);
+    /// Standard deviation from `moments [images, 2]`: `loss [images]`. Extent: images.
+    GMSD_DEVIATION = "gmsd"/"deviation", GmsdParams, tile FLAT,
+        (moments: f32) -> (loss: f32);
+    /// Gradient of `scale · loss` to the render's Prewitt responses: `d_response [images, 2, h2, w2]`, x then y; zero where the magnitude is zero.
+    GMSD_BACKWARD_SIMILARITY = "gmsd"/"backward_similarity", GmsdParams, tile FLAT,
+        (luma: f32, target_luma: f32, quality: f32, moments: f32, loss: f32) -> (d_response: f32);
+    /// Transposed Prewitt, pooling and luma: `d_rgb [images, height, width, 3]`, overwrites. Extent: images · height · width.
+    GMSD_BACKWARD_POOL = "gmsd"/"backward_pool", GmsdParams, tile FLAT,
+        (d_response: f32) -> (d_rgb: f32);
+    /// Adam: `m = β1 m + (1-β1) g`, `v = β2 v + (1-β2) g²`, `value -= lr (m · schedule[1]) / (√(v · schedule[2]) + ε)`,
+    /// `schedule = [lr, 1/(1-β1ᵗ), 1/(1-β2ᵗ)]`. Extent: count.
+    ADAM_STEP = "adam"/"step", AdamParams, tile FLAT,
+        (gradient: f32, schedule: f32) -> (value: f32, m: f32, v: f32);
+    /// `y[first_group + g, j] (+)= Σ_t x[g, t, j]`; `x [groups, terms, count]`. Extent: groups · count.
+    SUM_FORWARD = "sum"/"forward", SumParams, tile FLAT,
+        (x: f32) -> (y: f32);
+    /// Where `loss[b] < best_loss[b]`: keeps loss and pose. `pose6 [B,6]`. Extent: poses.
+    KEEP_BEST_STEP = "keep_best"/"step", KeepBestParams, tile FLAT,
+        (loss: f32, pose6: f32) -> (best_loss: f32, best_pose6: f32);
+    /// RGB in [-1,1] to packed RGBA8 (r in the low byte, alpha 255), clamped and rounded: `rgb [.., 3]` → `packed [height, stride]`. Extent: width · height.
+    PACK_RGBA8_FORWARD = "pack_rgba8"/"forward", PackParams, tile FLAT,
+        (rgb: f32) -> (packed: u32);
+}
