@@ -1,0 +1,265 @@
+use std::collections::HashMap;
+use std::fmt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+
+use srn_plan::{ExecutorError, Kernel};
+use srn_shaders::Variant;
+
+use crate::pipeline::Pipeline;
+
+/// An adapter of this machine.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AdapterInfo {
+    /// Name that the driver gives, for example `llvmpipe (LLVM 15.0.6, 256 bits)`.
+    pub name: String,
+    /// `Vulkan`, `Metal` or `Dx12`.
+    pub backend: String,
+    /// The driver and its version.
+    pub driver: String,
+    /// True where the "GPU" is this machine's CPU (llvmpipe, WARP, SwiftShader).
+    pub software: bool,
+}
+
+impl From<wgpu::AdapterInfo> for AdapterInfo {
+    fn from(info: wgpu::AdapterInfo) -> Self {
+        AdapterInfo {
+            name: info.name,
+            backend: format!("{:?}", info.backend),
+            driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+            software: info.device_type == wgpu::DeviceType::Cpu,
+        }
+    }
+}
+
+impl fmt::Display for AdapterInfo {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} ({}, {})", self.name, self.backend, self.driver)
+    }
+}
+
+/// Why no device could be opened.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum OpenError {
+    /// No driver of any backend reports an adapter.
+    #[error("no GPU adapter found (on Linux without a GPU, install the package mesa-vulkan-drivers)")]
+    NoAdapter,
+    /// Adapters exist, but none has the wanted name.
+    #[error("no adapter is called `{wanted}`; found: {}", found.join(", "))]
+    NotFound {
+        /// Part of a name that was asked for.
+        wanted: String,
+        /// Names of the adapters that exist.
+        found: Vec<String>,
+    },
+    /// The adapter gave no device.
+    #[error("adapter `{adapter}` refuses a device: {what}")]
+    Refused {
+        /// Name of the adapter.
+        adapter: String,
+        /// The driver's reason.
+        what: String,
+    },
+}
+
+/// All adapters, the one that [`Gpu::open`] prefers first: discrete, integrated, virtual, other, software.
+pub fn adapters() -> Vec<AdapterInfo> {
+    enumerate().iter().map(|adapter| adapter.get_info().into()).collect()
+}
+
+fn enumerate() -> Vec<wgpu::Adapter> {
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
+        // Also in debug builds no validation layers, which report false errors; the environment can turn them on.
+        flags: wgpu::InstanceFlags::empty().with_env(),
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    });
+    let mut found = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::all()));
+    found.sort_by_key(|adapter| match adapter.get_info().device_type {
+        wgpu::DeviceType::DiscreteGpu => 0,
+        wgpu::DeviceType::IntegratedGpu => 1,
+        wgpu::DeviceType::VirtualGpu => 2,
+        wgpu::DeviceType::Other => 3,
+        wgpu::DeviceType::Cpu => 4,
+    });
+    found
+}
+
+type Sources = dyn Fn(&Kernel, &Variant) -> String + Send + Sync;
+
+/// What all clones of a [`Gpu`] share.
+#[derive(Default)]
+struct Shared {
+    pipelines: Mutex<HashMap<String, Arc<Pipeline>>>,
+    /// What the device reported outside of any call of ours; a lost device stays lost.
+    uncaptured: Mutex<Option<String>>,
+    lost: Mutex<Option<String>>,
+}
+
+/// A device with its queue and compiled kernels; clones share them, and may be used from any thread.
+#[derive(Clone)]
+pub struct Gpu {
+    device: wgpu::Device,
+    queue: wgpu::Queue,
+    shared: Arc<Shared>,
+    sources: Arc<Sources>,
+}
+
+impl Gpu {
+    /// Opens the adapter whose name contains `adapter_name` (in any case), or the first of [`adapters`].
+    pub fn open(adapter_name: Option<&str>) -> Result<Gpu, OpenError> {
+        let mut found = enumerate();
+        let names: Vec<String> = found.iter().map(|adapter| adapter.get_info().name).collect();
+        let chosen = match adapter_name {
+            _ if names.is_empty() => return Err(OpenError::NoAdapter),
+            None => 0,
+            Some(wanted) => names
+                .iter()
+                .position(|name| name.to_lowercase().contains(&wanted.to_lowercase()))
+                .ok_or_else(|| OpenError::NotFound { wanted: wanted.into(), found: names.clone() })?,
+        };
+        let adapter = found.swap_remove(chosen);
+        let optional = wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::SUBGROUP;
+        let request = adapter.request_device(&wgpu::DeviceDescriptor {
+            label: Some("sigma-srn"),
+            required_features: adapter.features() & optional,
+            // Default limits, so that what runs here runs elsewhere, except for the size of the work.
+            required_limits: wgpu::Limits {
+                max_storage_buffer_binding_size: adapter.limits().max_storage_buffer_binding_size,
+                max_buffer_size: adapter.limits().max_buffer_size,
+                ..wgpu::Limits::default()
+            },
+            memory_hints: wgpu::MemoryHints::MemoryUsage,
+            ..Default::default()
+        });
+        let (device, queue) = pollster::block_on(request)
+            .map_err(|error| OpenError::Refused { adapter: names[chosen].clone(), what: one_line(&error.to_string()) })?;
+        let gpu = Gpu::from_device(device, queue);
+        let shared = gpu.shared.clone();
+        gpu.device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            lock(&shared.uncaptured).get_or_insert(one_line(&error.to_string()));
+        }));
+        let shared = gpu.shared.clone();
+        gpu.device.set_device_lost_callback(move |reason, message| {
+            lock(&shared.lost).get_or_insert(format!("the device was lost ({reason:?}): {}", one_line(&message)));
+        });
+        Ok(gpu)
+    }
+
+    /// Uses the caller's device and queue, within that device's features and limits.
+    ///
+    /// The caller's error handlers stay as they are: errors caused by calls of this crate are caught in error scopes.
+    pub fn from_device(device: wgpu::Device, queue: wgpu::Queue) -> Gpu {
+        tracing::debug!(adapter = %AdapterInfo::from(device.adapter_info()), features = ?device.features(), "device");
+        Gpu { device, queue, shared: Arc::default(), sources: Arc::new(Kernel::source) }
+    }
+
+    /// The same device, with WGSL texts from `sources` in place of [`Kernel::source`]: kernels in development, planted faults.
+    pub fn with_sources(&self, sources: impl Fn(&Kernel, &Variant) -> String + Send + Sync + 'static) -> Gpu {
+        Gpu { sources: Arc::new(sources), ..self.clone() }
+    }
+
+    /// The adapter behind the device.
+    pub fn adapter(&self) -> AdapterInfo {
+        self.device.adapter_info().into()
+    }
+
+    /// The device.
+    pub fn device(&self) -> &wgpu::Device {
+        &self.device
+    }
+
+    /// Its queue.
+    pub fn queue(&self) -> &wgpu::Queue {
+        &self.queue
+    }
+
+    /// Bytes that one buffer may have: the limit for `srn_plan::Builder::new`.
+    pub fn max_binding_bytes(&self) -> u64 {
+        let limits = self.device.limits();
+        limits.max_storage_buffer_binding_size.min(limits.max_buffer_size)
+    }
+
+    /// Bytes that a plan may take where the user sets no budget: 4 GiB on a discrete GPU; 2 GiB on adapters that take
+    /// their memory from the machine. (wgpu does not tell how much there is.)
+    pub fn default_memory_budget(&self) -> u64 {
+        match self.device.adapter_info().device_type {
+            wgpu::DeviceType::DiscreteGpu => 4 << 30,
+            _ => 2 << 30,
+        }
+    }
+
+    /// The pipeline of a kernel variant, compiled on first use.
+    pub(crate) fn pipeline(&self, kernel: &Kernel, variant: &Variant) -> Result<Arc<Pipeline>, ExecutorError> {
+        let text = (self.sources)(kernel, variant);
+        let mut pipelines = lock(&self.shared.pipelines);
+        if let Some(pipeline) = pipelines.get(&text) {
+            return Ok(pipeline.clone());
+        }
+        let pipeline = Arc::new(Pipeline::new(self, kernel, variant, &text)?);
+        pipelines.insert(text, pipeline.clone());
+        Ok(pipeline)
+    }
+
+    /// Does `work` and returns the first error that wgpu reports for it, or that the device reported since the last call.
+    pub(crate) fn checked<T>(&self, what: &str, work: impl FnOnce() -> T) -> Result<T, ExecutorError> {
+        use wgpu::ErrorFilter::{Internal, OutOfMemory, Validation};
+        let scopes = [Validation, OutOfMemory, Internal].map(|filter| self.device.push_error_scope(filter));
+        let value = work();
+        // Popped in reverse, all of them; natively the errors of a call are known when it returns.
+        let errors: Vec<_> = scopes.into_iter().rev().filter_map(|scope| pollster::block_on(scope.pop())).collect();
+        // A lost device explains every other error.
+        let lost = lock(&self.shared.lost).clone();
+        let error = lost.or_else(|| match errors.first() {
+            Some(wgpu::Error::OutOfMemory { .. }) => Some("out of device memory; set a smaller memory budget".into()),
+            Some(error) => Some(one_line(&error.to_string())),
+            None => lock(&self.shared.uncaptured).take(),
+        });
+        error.map_or(Ok(value), |error| Err(ExecutorError::Device { what: format!("{what}: {error}") }))
+    }
+
+    /// Reads the first `bytes` of a buffer with usage `COPY_SRC`, after all work submitted before.
+    pub(crate) fn download(&self, what: &str, buffer: &wgpu::Buffer, bytes: u64) -> Result<wgpu::BufferView, ExecutorError> {
+        let failed = |error: String| ExecutorError::Device { what: format!("{what}: {error}") };
+        let (sender, receiver) = mpsc::channel();
+        let staging = self.checked(what, || {
+            let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some("read back"),
+                size: bytes,
+                usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            });
+            let mut encoder = self.device.create_command_encoder(&Default::default());
+            encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
+            let submission_index = Some(self.queue.submit([encoder.finish()]));
+            staging.slice(..).map_async(wgpu::MapMode::Read, move |result| drop(sender.send(result)));
+            // wgpu panics in `poll` when the driver reports a lost device; no lock is held there.
+            let wait = wgpu::PollType::Wait { submission_index, timeout: None };
+            catch_unwind(AssertUnwindSafe(|| self.device.poll(wait)))
+                .map_err(|_| "the device was lost".to_owned())
+                .and_then(|status| status.map_err(|error| error.to_string()))
+                .map(|_| staging)
+        })?;
+        let staging = staging.map_err(failed)?;
+        // Another thread's `poll` may be the one that calls back, after ours has returned: wait for it.
+        match receiver.recv() {
+            Ok(Ok(())) => staging.slice(..).get_mapped_range().map_err(|error| failed(one_line(&error.to_string()))),
+            _ => Err(failed("the device was lost, or the buffer cannot be mapped".into())),
+        }
+    }
+}
+
+impl fmt::Debug for Gpu {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Gpu").field(&self.adapter()).finish()
+    }
+}
+
+/// A panic elsewhere leaves these values whole: they are replaced, never half written.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// wgpu's messages are trees over several lines.
+fn one_line(message: &str) -> String {
+    message.lines().map(str::trim).filter(|line| !["", "Caused by:"].contains(line)).collect::<Vec<_>>().join(": ")
+}

@@ -1,0 +1,80 @@
+use std::collections::BTreeMap;
+
+use srn_plan::{Executor, ExecutorError, StageId};
+
+use crate::{GpuExecutor, launch};
+
+/// Time on the device of all steps of a stage that ran one kernel variant.
+#[derive(Clone, Debug, PartialEq)]
+pub struct KernelTime {
+    /// `op/variant`.
+    pub label: String,
+    /// Number of steps.
+    pub steps: usize,
+    /// Their time in all.
+    pub seconds: f64,
+    /// Their floating-point operations in all, matrix products only.
+    pub flops: u64,
+}
+
+impl GpuExecutor {
+    /// Runs a stage with a timestamp before and after each step; the slowest kernel comes first.
+    ///
+    /// Needs a device with `TIMESTAMP_QUERY` ([`Gpu::open`](crate::Gpu::open) asks for it). Steps cannot overlap in this
+    /// run, so the sum may exceed the time of a plain run.
+    pub fn profile(&mut self, stage: StageId) -> Result<Vec<KernelTime>, ExecutorError> {
+        if !self.gpu().device().features().contains(wgpu::Features::TIMESTAMP_QUERY) {
+            return Err(ExecutorError::Device { what: format!("{} has no timestamps", self.describe()) });
+        }
+        self.attempt(|this| {
+            let mut times: BTreeMap<&str, KernelTime> = BTreeMap::new();
+            for part in launch::submissions(&this.plan().stage(stage).steps) {
+                let seconds = this.timed(stage, part.clone())?;
+                for (index, seconds) in part.zip(seconds) {
+                    let label = this.launches(stage)[index].label.as_str();
+                    let new = || KernelTime { label: label.into(), steps: 0, seconds: 0.0, flops: 0 };
+                    let time = times.entry(label).or_insert_with(new);
+                    time.steps += 1;
+                    time.seconds += seconds;
+                    time.flops += this.plan().stage(stage).steps[index].flops;
+                }
+            }
+            let mut times: Vec<_> = times.into_values().collect();
+            times.sort_by(|a, b| b.seconds.total_cmp(&a.seconds));
+            Ok(times)
+        })
+    }
+
+    /// Seconds of each step of one submission.
+    fn timed(&self, stage: StageId, part: std::ops::Range<usize>) -> Result<Vec<f64>, ExecutorError> {
+        let (device, queue) = (self.gpu().device(), self.gpu().queue());
+        let count = 2 * part.len() as u32;
+        let ticks = self.gpu().checked("timing", || {
+            let ty = wgpu::QueryType::Timestamp;
+            let query_set = device.create_query_set(&wgpu::QuerySetDescriptor { label: Some("steps"), ty, count });
+            let ticks = device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some("ticks"),
+                size: 8 * u64::from(count),
+                usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
+                mapped_at_creation: false,
+            });
+            let mut encoder = device.create_command_encoder(&Default::default());
+            for (index, launch) in self.launches(stage)[part].iter().enumerate() {
+                let timestamp_writes = Some(wgpu::ComputePassTimestampWrites {
+                    query_set: &query_set,
+                    beginning_of_pass_write_index: Some(2 * index as u32),
+                    end_of_pass_write_index: Some(2 * index as u32 + 1),
+                });
+                let label = Some(launch.label.as_str());
+                launch.dispatch(&mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label, timestamp_writes }));
+            }
+            encoder.resolve_query_set(&query_set, 0..count, &ticks, 0);
+            queue.submit([encoder.finish()]);
+            ticks
+        })?;
+        let view = self.gpu().download("timing", &ticks, 8 * u64::from(count))?;
+        let ticks: Vec<u64> = bytemuck::pod_collect_to_vec(&view[..]);
+        let period = f64::from(queue.get_timestamp_period()) * 1e-9;
+        Ok(ticks.chunks_exact(2).map(|pair| pair[1].saturating_sub(pair[0]) as f64 * period).collect())
+    }
+}
