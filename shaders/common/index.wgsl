@@ -3,3 +3,9 @@
 fn flat_index(workgroup: vec3<u32>, workgroups: vec3<u32>, local: vec3<u32>) -> u32 {
     return (workgroup.y * workgroups.x + workgroup.x) * 64u + local.x;
 }
+
+// Coordinates of this invocation in a two-dimensional grid of 8×8 workgroups. Successive lanes run along the longer side
+// of the extent, so that a narrow one (ten rows, one feature) leaves few of them idle.
+fn tile_index(workgroup: vec3<u32>, local: vec3<u32>, extent: vec2<u32>) -> vec2<u32> {
+    return 8u * workgroup.xy + select(local.xy, local.yx, extent.y > extent.x);
+}

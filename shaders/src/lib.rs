@@ -42,7 +42,8 @@ pub struct Binding {
 pub enum Requirement {
     /// Nothing: any adapter, any size.
     Nothing,
-    /// `in_features` and `out_features` are multiples of 4 (the buffers are read as `vec4<f32>`).
+    /// Every parameter named `features`, `in_features`, `out_features`, `first_out` or `end_out` is a multiple of 4 (f32
+    /// buffers may be read as `vec4<f32>`).
     FeaturesMultipleOf4,
 }
 
@@ -94,4 +95,12 @@ pub fn find(name: &str) -> Option<&'static Kernel> {
 }
 
 /// Functions that every kernel can call.
-pub const COMMON: &str = include_str!("../common/index.wgsl");
+pub const COMMON: &str = concat!(
+    include_str!("../common/index.wgsl"),
+    "\n",
+    include_str!("../common/activation.wgsl"),
+    "\n",
+    include_str!("../common/image_loss.wgsl"),
+    "\n",
+    include_str!("../common/gmsd.wgsl"),
+);

@@ -82,22 +82,27 @@ table! {
         (index: u32, d_z: f32) -> (d_codes: f32);
     /// `y[r,o] (+)= Σ_i W[o,i] x[r,i] + b[o]`, weights at `slots[first_group + r / rows_per_group] · weight_stride`.
     /// Extent: rows of a group × out_features × groups.
-    LINEAR_FORWARD = "linear"/"forward", LinearParams, tile [64, 8, 1],
-        (x: f32, weights: f32, slots: u32) -> (y: f32);
+    LINEAR_FORWARD = "linear"/"forward", LinearParams, tile [32, 32, 1],
+        (x: f32, weights: f32, slots: u32) -> (y: f32),
+        or "forward_vec4" tile [64, 64, 1], when FeaturesMultipleOf4;
     /// `d_x[r,i] (+)= Σ_{o=first_out}^{end_out-1} W[o,i] d_y[r,o]`. Extent: rows of a group × in_features × groups.
-    LINEAR_BACKWARD_INPUT = "linear"/"backward_input", LinearParams, tile [64, 8, 1],
-        (d_y: f32, weights: f32, slots: u32) -> (d_x: f32);
+    LINEAR_BACKWARD_INPUT = "linear"/"backward_input", LinearParams, tile [32, 32, 1],
+        (d_y: f32, weights: f32, slots: u32) -> (d_x: f32),
+        or "backward_input_vec4" tile [64, 64, 1], when FeaturesMultipleOf4;
     /// `partial[g,c] (+)= (Σ_r d_y[r,o] x[r,i], Σ_r d_y[r,o])` over the rows of chunk `c`: weight, then bias; `[groups, chunks, out·in + out]`.
     /// Extent: out_features × in_features × (groups · chunks). (Independent of `slots`: group `g` writes set `g`.)
-    LINEAR_BACKWARD_WEIGHT = "linear"/"backward_weight", LinearParams, tile [8, 64, 1],
-        (x: f32, d_y: f32) -> (partial: f32);
+    LINEAR_BACKWARD_WEIGHT = "linear"/"backward_weight", LinearParams, tile [32, 32, 1],
+        (x: f32, d_y: f32) -> (partial: f32),
+        or "backward_weight_vec4" tile [64, 64, 1], when FeaturesMultipleOf4;
     /// `y = relu(gamma (x - mean) rstd + beta)`, `rstd = 1/√(var + 1e-5)`, biased variance.
     /// `x [rows, features]`, `affine [2, features]` → `y`, `stats [rows,2]` = (mean, rstd). Extent: rows.
     LAYER_NORM_RELU_FORWARD = "layer_norm_relu"/"forward", LayerNormParams, tile FLAT,
-        (x: f32, affine: f32) -> (y: f32, stats: f32);
+        (x: f32, affine: f32) -> (y: f32, stats: f32),
+        or "forward_vec4" tile FLAT, when FeaturesMultipleOf4;
     /// Gradient to `x`: with `e = gamma · d_y` where `y > 0`, else 0: `d_x = rstd (e - mean(e) - x̂ mean(e x̂))`. Extent: rows.
     LAYER_NORM_RELU_BACKWARD_INPUT = "layer_norm_relu"/"backward_input", LayerNormParams, tile FLAT,
-        (x: f32, stats: f32, affine: f32, d_y: f32) -> (d_x: f32);
+        (x: f32, stats: f32, affine: f32, d_y: f32) -> (d_x: f32),
+        or "backward_input_vec4" tile FLAT, when FeaturesMultipleOf4;
     /// Sums of `d_y x̂` and `d_y` (where `y > 0`) over the rows of each chunk: `partial [chunks, 2, features]`. Extent: features × chunks.
     LAYER_NORM_RELU_BACKWARD_AFFINE = "layer_norm_relu"/"backward_affine", LayerNormParams, tile [64, 1, 1],
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32);
@@ -135,30 +140,33 @@ table! {
     /// `d_z += 2 scale z`: ACCUMULATES onto the gradient that came through the hypernetwork. Extent: count.
     LATENT_LOSS_BACKWARD = "latent_loss"/"backward", TermParams, tile FLAT,
         (z: f32) -> (d_z: f32);
-    /// Number of target values that are not exactly 1: `target [images · rows_per_group, 3]` → `partial [groups, chunks]`. Extent: groups · chunks.
+    /// Number of target values that are not exactly 1: `target_rgb [groups · rows_per_group, 3]` → `partial [groups, chunks]`. Extent: groups · chunks.
     IMAGE_LOSS_COUNT = "image_loss"/"count", ImageLossParams, tile FLAT,
         (target_rgb: f32) -> (partial: f32);
     /// Sum of `|e|` or `e²` over the rows of a chunk, times the normaliser: `1 / values_per_image` (MAE, MSE) or
-    /// `1 / (1 + count[image])` (norm_l1, norm_l2). `partial [groups, chunks]`. Extent: groups · chunks.
+    /// `1 / (1 + count[image])` (norm_l1, norm_l2), `image = first_group + group`. `rgb, target_rgb [groups · rows_per_group, 3]`
+    /// of the tile, `count [images]` of the whole batch (not read for MAE and MSE) → `partial [groups, chunks]`. Extent: groups · chunks.
     IMAGE_LOSS_FORWARD = "image_loss"/"forward", ImageLossParams, tile FLAT,
         (rgb: f32, target_rgb: f32, count: f32) -> (partial: f32);
     /// `d_rgb = scale · normaliser · sign(e)` or `· 2e`; `sign(0) = 0`. Extent: values.
     IMAGE_LOSS_BACKWARD = "image_loss"/"backward", ImageLossParams, tile FLAT,
         (rgb: f32, target_rgb: f32, count: f32) -> (d_rgb: f32);
-    /// To [0,1], YIQ luma `0.299 R + 0.587 G + 0.114 B`, 2×2 average: `rgb [images, height, width, 3]` → `luma [images, h2, w2]`,
+    /// To [0,1] (not clamped), YIQ luma `0.299 R + 0.587 G + 0.114 B`, 2×2 average: `rgb [images, height, width, 3]` → `luma [images, h2, w2]`,
     /// `h2 = height / 2`, `w2 = width / 2` rounded down. Extent: images · h2 · w2, as for the next ones.
     GMSD_POOL = "gmsd"/"pool", GmsdParams, tile FLAT,
         (rgb: f32) -> (luma: f32);
-    /// Prewitt magnitudes `a, b` (3×3 / 3, zero padding) of both images, `quality = (2ab + c)/(a² + b² + c)`, `c = 170/255²`.
+    /// Prewitt magnitudes `a, b` (3×3 / 3, zero padding; x = right - left, y = below - above) of both images, `quality = (2ab + c)/(a² + b² + c)`, `c = 170/255²`.
     GMSD_SIMILARITY = "gmsd"/"similarity", GmsdParams, tile FLAT,
         (luma: f32, target_luma: f32) -> (quality: f32);
     /// `Σ (q - 1)` and `Σ (q - 1)²` per chunk: `partial [images, chunks, 2]`. Extent: images · chunks.
     GMSD_MOMENTS = "gmsd"/"moments", GmsdParams, tile FLAT,
         (quality: f32) -> (partial: f32);
-    /// Standard deviation from `moments [images, 2]`: `loss [images]`. Extent: images.
+    /// Biased standard deviation `√(S2/n - (S1/n)²)`, `n = h2 · w2`, from `moments [images, 2] = (S1, S2)`: `loss [images]`. Extent: images.
     GMSD_DEVIATION = "gmsd"/"deviation", GmsdParams, tile FLAT,
         (moments: f32) -> (loss: f32);
-    /// Gradient of `scale · loss` to the render's Prewitt responses: `d_response [images, 2, h2, w2]`, x then y; zero where the magnitude is zero.
+    /// Gradient of `scale · loss` to the render's Prewitt responses: `∂loss/∂q = (q - 1 - S1/n) / (n loss)`,
+    /// `∂q/∂a = 2 (b - a q) / (a² + b² + c)`, `∂a/∂response = response / a`; `d_response [images, 2, h2, w2]`, x then y;
+    /// zero where the magnitude or the loss is zero.
     GMSD_BACKWARD_SIMILARITY = "gmsd"/"backward_similarity", GmsdParams, tile FLAT,
         (luma: f32, target_luma: f32, quality: f32, moments: f32, loss: f32) -> (d_response: f32);
     /// Transposed Prewitt, pooling and luma: `d_rgb [images, height, width, 3]`, overwrites. Extent: images · height · width.

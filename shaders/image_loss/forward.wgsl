@@ -1,0 +1,51 @@
+// partial[g, c] = normaliser Σ |e| (MAE, norm_l1) or Σ e² (MSE, norm_l2) over the rows of chunk c, e = rgb - target_rgb.
+// One invocation sums one chunk of one image.
+// rgb, target_rgb [groups · rows_per_group, 3], count [images] (norm_l1 and norm_l2 only) → partial [groups, chunks].
+// OVERWRITES partial.
+
+struct Params {
+    kind: u32,
+    groups: u32,
+    rows_per_group: u32,
+    first_group: u32,
+    values_per_image: u32,
+    chunk_rows: u32,
+    chunks: u32,
+    scale: f32,
+}
+
+@group(0) @binding(0) var<uniform> params: Params;
+@group(0) @binding(1) var<storage, read> rgb: array<f32>;
+@group(0) @binding(2) var<storage, read> target_rgb: array<f32>;
+@group(0) @binding(3) var<storage, read> count: array<f32>;
+@group(0) @binding(4) var<storage, read_write> partial: array<f32>;
+
+fn normaliser(image: u32) -> f32 {
+    if (params.kind == NORM_L1 || params.kind == NORM_L2) {
+        return 1.0 / (1.0 + count[image]);
+    }
+    return 1.0 / f32(params.values_per_image);
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_id) local: vec3<u32>,
+) {
+    let index = flat_index(workgroup, workgroups, local);
+    if (index >= params.groups * params.chunks) {
+        return;
+    }
+    let group = index / params.chunks;
+    let image = 3u * group * params.rows_per_group;
+    let first = (index % params.chunks) * params.chunk_rows;
+    let end = min(first + params.chunk_rows, params.rows_per_group);
+    let squared = params.kind == MSE || params.kind == NORM_L2;
+    var total = 0.0;
+    for (var i = image + 3u * first; i < image + 3u * end; i++) {
+        let e = rgb[i] - target_rgb[i];
+        total += select(abs(e), e * e, squared);
+    }
+    partial[index] = normaliser(params.first_group + group) * total;
+}

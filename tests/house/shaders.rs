@@ -1,0 +1,137 @@
+//! Every WGSL text of the table is valid and is what the table says: parameters, bindings, access, entry point, opening lines.
+
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+use naga::{AddressSpace, GlobalVariable, Module, ScalarKind, ShaderStage, StorageAccess, TypeInner};
+use srn_shaders::{Binding, COMMON, Element, Kernel, Requirement, Scalar, TABLE, Variant};
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// Every variant of every kernel, with its label and parsed module.
+fn modules() -> impl Iterator<Item = (String, &'static Kernel, &'static Variant, Module)> {
+    TABLE.iter().flat_map(|kernel| {
+        kernel.variants.iter().map(move |variant| {
+            let label = format!("{}/{}.wgsl", kernel.op, variant.name);
+            let source = kernel.source(variant);
+            let module = naga::front::wgsl::parse_str(&source)
+                .unwrap_or_else(|error| panic!("{label}: {}", error.emit_to_string(&source)));
+            (label, *kernel, variant, module)
+        })
+    })
+}
+
+fn global<'m>(module: &'m Module, name: &str) -> Option<&'m GlobalVariable> {
+    module.global_variables.iter().map(|(_, variable)| variable).find(|variable| variable.name.as_deref() == Some(name))
+}
+
+#[test]
+fn every_kernel_validates() {
+    for (label, kernel, variant, module) in modules() {
+        if let Err(error) = Validator::new(ValidationFlags::all(), Capabilities::default()).validate(&module) {
+            panic!("{label}: {}", error.emit_to_string(&kernel.source(variant)));
+        }
+    }
+}
+
+#[test]
+fn every_kernel_has_one_entry_point_main() {
+    for (label, _, variant, module) in modules() {
+        assert_eq!(module.entry_points.len(), 1, "{label}");
+        let main = &module.entry_points[0];
+        assert_eq!((main.name.as_str(), main.stage), ("main", ShaderStage::Compute), "{label}");
+        assert_eq!(main.workgroup_size.iter().product::<u32>(), 64, "{label}");
+        for (tile, size) in variant.tile.iter().zip(main.workgroup_size) {
+            assert_eq!(tile % size, 0, "{label}: tile {:?}, workgroup {:?}", variant.tile, main.workgroup_size);
+        }
+    }
+}
+
+#[test]
+fn params_have_the_layout_of_the_rust_struct() {
+    for (label, kernel, _, module) in modules() {
+        let params = global(&module, "params").unwrap_or_else(|| panic!("{label}: no params"));
+        assert_eq!(params.space, AddressSpace::Uniform, "{label}");
+        assert_eq!(params.binding.map(|b| (b.group, b.binding)), Some((0, 0)), "{label}");
+        let ty = &module.types[params.ty];
+        assert_eq!(ty.name.as_deref(), Some("Params"), "{label}");
+        let TypeInner::Struct { members, span } = &ty.inner else { panic!("{label}: params is no struct") };
+        let found: Vec<_> = members
+            .iter()
+            .map(|member| {
+                let scalar = match module.types[member.ty].inner {
+                    TypeInner::Scalar(naga::Scalar::U32) => Scalar::U32,
+                    TypeInner::Scalar(naga::Scalar::F32) => Scalar::F32,
+                    ref other => panic!("{label}: params.{:?} is {other:?}", member.name),
+                };
+                (member.name.as_deref().unwrap_or(""), scalar, member.offset as usize)
+            })
+            .collect();
+        assert_eq!(found, kernel.params.fields, "{label} against {}", kernel.params.name);
+        assert_eq!(*span as usize, kernel.params.size, "{label} against {}", kernel.params.name);
+    }
+}
+
+/// Checks one storage variable: `array<T>`, or `array<vec4<T>>` where the variant asks for multiples of 4.
+fn check_storage(label: &str, module: &Module, number: u32, binding: &Binding, requires: Requirement) {
+    let label = format!("{label}: {}", binding.name);
+    let variable = global(module, binding.name).unwrap_or_else(|| panic!("{label} is missing"));
+    assert_eq!(variable.binding.map(|b| (b.group, b.binding)), Some((0, number)), "{label}");
+    let access = if binding.written { StorageAccess::LOAD | StorageAccess::STORE } else { StorageAccess::LOAD };
+    assert_eq!(variable.space, AddressSpace::Storage { access }, "{label}");
+    let TypeInner::Array { base, size: naga::ArraySize::Dynamic, .. } = module.types[variable.ty].inner else {
+        panic!("{label} is no array");
+    };
+    let scalar = match (&module.types[base].inner, requires) {
+        (TypeInner::Scalar(scalar), _) => scalar,
+        (TypeInner::Vector { size: naga::VectorSize::Quad, scalar }, Requirement::FeaturesMultipleOf4) => scalar,
+        (other, _) => panic!("{label} has elements {other:?}"),
+    };
+    let kind = match binding.element {
+        Element::F32 => ScalarKind::Float,
+        Element::U32 => ScalarKind::Uint,
+    };
+    assert_eq!((scalar.kind, scalar.width), (kind, 4), "{label}");
+}
+
+#[test]
+fn bindings_are_those_of_the_table() {
+    for (label, kernel, variant, module) in modules() {
+        for (number, binding) in (1..).zip(kernel.bindings) {
+            check_storage(&label, &module, number, binding, variant.requires);
+        }
+        let bound = module.global_variables.iter().filter(|(_, variable)| variable.binding.is_some()).count();
+        assert_eq!(bound, 1 + kernel.bindings.len(), "{label}: number of bindings");
+        assert!(kernel.bindings.len() <= 8, "{label}: more storage buffers than every adapter offers");
+    }
+}
+
+#[test]
+fn opening_lines_say_what_a_kernel_does() {
+    for (label, _, variant, _) in modules() {
+        let lines: Vec<_> = variant.text.lines().take(5).collect();
+        assert!(lines[..4].iter().all(|line| line.starts_with("// ")), "{label}: four comment lines: {lines:?}");
+        assert!(lines[0].contains('='), "{label}: the first line is the formula: {}", lines[0]);
+        assert!(lines[1].starts_with("// One invocation "), "{label}: {}", lines[1]);
+        assert!(lines[2].contains(" → "), "{label}: the third line is the shapes: {}", lines[2]);
+        assert!(lines[3].contains("OVERWRITES") || lines[3].contains("ACCUMULATES"), "{label}: {}", lines[3]);
+        assert_eq!(lines[4], "", "{label}: four comment lines, not more");
+    }
+}
+
+#[test]
+fn every_wgsl_file_is_in_the_table() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shaders");
+    let known: BTreeSet<String> = modules().map(|(label, ..)| label).collect();
+    let mut found = BTreeSet::new();
+    for op in std::fs::read_dir(&root).unwrap().map(|entry| entry.unwrap()).filter(|entry| entry.path().is_dir()) {
+        for file in std::fs::read_dir(op.path()).unwrap().map(|entry| entry.unwrap()) {
+            let (op, name) = (op.file_name().into_string().unwrap(), file.file_name().into_string().unwrap());
+            let text = std::fs::read_to_string(file.path()).unwrap();
+            if op == "common" {
+                assert!(COMMON.contains(text.trim_end()), "shaders/common/{name} is in no kernel");
+            } else if name.ends_with(".wgsl") {
+                found.insert(format!("{op}/{name}"));
+            }
+        }
+    }
+    assert_eq!(found, known);
+}
