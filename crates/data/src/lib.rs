@@ -1,1 +1,21 @@
-//! placeholder
+//! This crate owns images, SRN data sets, meshes, and the cameras that look at them.
+//! It does not know the network, the GPU or the command line, and it never prints.
+//!
+//! Conventions, everywhere: camera axes x right, y down, z forward; `world_from_camera` maps camera to world; the world is
+//! z-up; objects have a unit bounding-box diagonal centred at the origin; pixel `(u, v)` is the *centre* of a pixel, row-major
+//! `v·W + u`; images are RGB in [-1, 1].
+
+pub mod camera;
+mod error;
+pub mod inspect;
+pub mod ldraw;
+pub mod mesh;
+pub mod obj;
+pub mod pixels;
+pub mod sheet;
+pub mod srn;
+
+pub use camera::Camera;
+pub use error::{Error, Result};
+pub use mesh::Mesh;
+pub use srn::{Dataset, Instance, LoadedView, SrnSet};

@@ -1,0 +1,255 @@
+//! `sigma-data`: renders meshes into SRN data sets, and looks into such sets.
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use image::RgbImage;
+use srn_data::mesh::{Mesh, Up};
+use srn_data::srn::{InstanceWriter, Intrinsics};
+use srn_data::{SrnSet, camera, inspect, ldraw, obj};
+use srn_gpu::raster::{self, Rasterizer};
+use std::error::Error;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+type Result<T> = std::result::Result<T, Box<dyn Error>>;
+
+/// Data sets in the SRN folder layout: <set>/<instance>/{rgb,pose,intrinsics.txt}.
+#[derive(Parser)]
+#[command(version, about)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Render meshes to pictures with known cameras, one instance per mesh.
+    Render(Render),
+    /// Count, check and draw a data set. Exit status 1 if something is wrong with it.
+    Inspect(Inspect),
+}
+
+#[derive(Args)]
+struct Render {
+    /// Meshes: Wavefront .obj, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The instance is called NAME, or
+    /// like the file.
+    #[arg(required = true, value_name = "[NAME=]MESH", value_parser = named_mesh)]
+    meshes: Vec<(String, PathBuf)>,
+    /// The data set's folder; instances are made inside.
+    #[arg(long)]
+    out: PathBuf,
+    /// Width and height of the pictures in pixels.
+    #[arg(long, default_value_t = 64)]
+    side: usize,
+    /// Distance of the cameras to the object's centre; the diagonal of its bounding box is 1.
+    #[arg(long, default_value_t = 1.3)]
+    radius: f64,
+    /// Views per object.
+    #[arg(long, default_value_t = 50)]
+    views: usize,
+    /// Where the cameras stand.
+    #[arg(long, value_enum, default_value_t = Cameras::Sphere)]
+    cameras: Cameras,
+    /// Decides the random cameras, together with each instance's name.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Focal length in pixels. Default: the object's bounding sphere just fits into the picture.
+    #[arg(long, conflicts_with = "fov")]
+    focal: Option<f64>,
+    /// Angle of view in degrees, instead of --focal.
+    #[arg(long)]
+    fov: Option<f64>,
+    /// Which axis points up in .obj files (LDraw has its own).
+    #[arg(long, value_enum, default_value_t = ObjUp::Y)]
+    up: ObjUp,
+    /// Replace instances that exist in the output folder.
+    #[arg(long)]
+    force: bool,
+    /// Name, or part of it, of the graphics adapter. Default: the first that is not a software one, else the first.
+    #[arg(long)]
+    adapter: Option<String>,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Cameras {
+    /// Uniformly random on the sphere.
+    Sphere,
+    /// Along a spiral from pole to pole.
+    Spiral,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum ObjUp {
+    Y,
+    Z,
+}
+
+#[derive(Args)]
+struct Inspect {
+    /// A data set, or a single instance.
+    dir: PathBuf,
+    /// Print the findings as JSON.
+    #[arg(long)]
+    json: bool,
+    /// Write a contact sheet with a drawing of the cameras to this PNG file.
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Overwrite the PNG file.
+    #[arg(long)]
+    force: bool,
+}
+
+fn main() -> ExitCode {
+    let done = match Cli::parse().command {
+        Command::Render(args) => render(&args).map(|()| true),
+        Command::Inspect(args) => inspect(&args),
+    };
+    match done {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(1),
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn render(args: &Render) -> Result<()> {
+    let focal = match (args.focal, args.fov) {
+        (Some(focal), _) => focal,
+        (_, Some(fov)) => 0.5 * args.side as f64 / (0.5 * fov.to_radians()).tan(),
+        _ => camera::fitting_focal_px(args.side, args.radius),
+    };
+    let positive = |x: f64| x.is_finite() && x > 0.0;
+    for (name, value) in
+        [("--focal", focal), ("--radius", args.radius - 0.5), ("--views", args.views as f64), ("--side", args.side as f64)]
+    {
+        if !positive(value) {
+            return Err(format!("{name}: out of range (the object has radius 0.5, and the camera must stand outside)").into());
+        }
+    }
+    // The SRN convention puts the principal point at side / 2 while integer coordinates are pixel centres.
+    let half = args.side as f64 / 2.0;
+    let intrinsics = Intrinsics { focal, centre: [half, half], size: [args.side, args.side] };
+
+    let mut names = std::collections::BTreeSet::new();
+    for (name, path) in &args.meshes {
+        let dir = args.out.join(name);
+        if !args.force && dir.exists() {
+            return Err(format!("{}: exists already; --force replaces it", dir.display()).into());
+        }
+        if !names.insert(name) {
+            return Err(format!("{}: two meshes have the same name", path.display()).into());
+        }
+    }
+    let (device, queue) = pollster::block_on(open_device(args.adapter.as_deref()))?;
+    let rasterizer = Rasterizer::new(&device, &queue);
+    let progress = indicatif::ProgressBar::new((args.meshes.len() * args.views) as u64)
+        .with_style(indicatif::ProgressStyle::with_template("{bar:30} {pos}/{len} {msg} {eta}")?);
+    for (name, path) in &args.meshes {
+        let mut mesh = load_mesh(path, args.up)?;
+        for warning in std::mem::take(&mut mesh.warnings) {
+            progress.suspend(|| eprintln!("warning: {}: {warning}", path.display()));
+        }
+        progress.set_message(name.clone());
+        let model = upload(&rasterizer, &mesh)?;
+        let writer = InstanceWriter::create(args.out.join(name), &intrinsics, args.force)?;
+        let poses = match args.cameras {
+            // Each object is seen from other places.
+            Cameras::Sphere => camera::uniform_sphere(args.views, args.radius, args.seed ^ ldraw::name_hash(name)),
+            Cameras::Spiral => camera::spiral(args.views, args.radius),
+        };
+        for (i, pose) in poses.iter().enumerate() {
+            let view = raster::View {
+                world_from_camera: pose.transpose().to_cols_array(),
+                intrinsics: [focal, focal, half, half],
+                side: args.side as u32,
+            };
+            let side = view.side;
+            let rgb = RgbImage::from_raw(side, side, rasterizer.render(&model, &view)?).ok_or("picture of the wrong size")?;
+            writer.add(&format!("{i:06}"), &rgb, pose)?;
+            progress.inc(1);
+        }
+    }
+    progress.finish_and_clear();
+    println!("{} instances of {} views in {}, {focal:.3} px focal length", args.meshes.len(), args.views, args.out.display());
+    Ok(())
+}
+
+fn named_mesh(argument: &str) -> std::result::Result<(String, PathBuf), String> {
+    let (name, path) = argument.split_once('=').unwrap_or(("", argument));
+    let path = PathBuf::from(path);
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    match if name.is_empty() { stem } else { name.into() } {
+        name if name.contains(['/', '\\']) || [".", "..", ""].contains(&name.as_str()) => {
+            Err(format!("\"{name}\" cannot name a folder"))
+        }
+        name => Ok((name, path)),
+    }
+}
+
+fn load_mesh(path: &Path, up: ObjUp) -> Result<Mesh> {
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    let (mut mesh, up) = match (extension.as_str(), up) {
+        ("dat", _) => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
+        ("obj", ObjUp::Y) => (obj::load(path)?, Up::Y),
+        ("obj", ObjUp::Z) => (obj::load(path)?, Up::Z),
+        _ => return Err(format!("{}: expected a .obj or .dat mesh", path.display()).into()),
+    };
+    mesh.normalise(up);
+    Ok(mesh)
+}
+
+fn upload(rasterizer: &Rasterizer, mesh: &Mesh) -> Result<raster::Model> {
+    let vertex = |v: &srn_data::mesh::Vertex| raster::Vertex {
+        position: v.position.to_array(),
+        normal: v.normal.to_array(),
+        colour: v.colour.to_array(),
+        uv: v.uv.to_array(),
+    };
+    let vertices: Vec<_> = mesh.vertices.iter().map(vertex).collect();
+    let part = |part: &srn_data::mesh::Part| (part.vertices.start as u32..part.vertices.end as u32, part.texture);
+    let parts: Vec<_> = mesh.parts.iter().map(part).collect();
+    let textures = mesh.textures.iter().map(|t| raster::Texture { width: t.width(), height: t.height(), rgba: t.as_raw() });
+    let textures: Vec<_> = textures.collect();
+    Ok(rasterizer.upload(&vertices, &parts, &textures)?)
+}
+
+async fn open_device(name: Option<&str>) -> Result<(wgpu::Device, wgpu::Queue)> {
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
+    let mut adapters = instance.enumerate_adapters(wgpu::Backends::PRIMARY).await;
+    adapters.sort_by_key(|adapter| adapter.get_info().device_type == wgpu::DeviceType::Cpu);
+    let fits = |adapter: &wgpu::Adapter| name.is_none_or(|n| adapter.get_info().name.to_lowercase().contains(&n.to_lowercase()));
+    let known: Vec<_> = adapters.iter().map(|adapter| adapter.get_info().name).collect();
+    let adapter = adapters.into_iter().find(fits).ok_or_else(|| match name {
+        Some(name) => format!("no graphics adapter called \"{name}\" among {known:?}"),
+        None => "no graphics adapter; a software one is in the package mesa-vulkan-drivers".into(),
+    })?;
+    eprintln!("adapter: {}", adapter.get_info().name);
+    Ok(adapter.request_device(&Default::default()).await?)
+}
+
+fn inspect(args: &Inspect) -> Result<bool> {
+    if let Some(out) = args.out.as_ref().filter(|out| out.exists() && !args.force) {
+        return Err(format!("{}: exists already; --force overwrites it", out.display()).into());
+    }
+    let set = SrnSet::open(&args.dir)?;
+    let report = inspect::inspect(&set)?;
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&report)?);
+    } else {
+        println!("{:<24} {:>6} {:>12} {:>10} {:>15} {:>10}", "instance", "views", "size", "focal px", "distance", "off axis");
+        for i in &report.instances {
+            let sizes = i.sizes.keys().cloned().collect::<Vec<_>>().join(" ");
+            let focal = i.focal_px.map_or("?".into(), |f| format!("{f:.3}"));
+            let radius = i.radius.map_or("?".into(), |[near, far]| format!("{near:.3} … {far:.3}"));
+            println!("{:<24} {:>6} {sizes:>12} {focal:>10} {radius:>15} {:>9.2}°", i.name, i.views, i.off_axis_deg);
+        }
+        let views: usize = report.instances.iter().map(|i| i.views).sum();
+        println!("{} instances, {views} views, {} problems", report.instances.len(), report.problems.len());
+        report.problems.iter().for_each(|problem| println!("problem: {problem}"));
+    }
+    if let Some(out) = &args.out {
+        inspect::contact_sheet(&set, &report, 8, 16).save(out).map_err(|error| format!("{}: {error}", out.display()))?;
+    }
+    Ok(report.problems.is_empty())
+}

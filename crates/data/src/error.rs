@@ -1,0 +1,80 @@
+use std::path::{Path, PathBuf};
+
+/// What can go wrong with a file. Every message names the file and, where there is one, the field with what was found and
+/// what was expected.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The operating system could not read or write the file.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// An image could not be decoded or encoded.
+    #[error("{}: not a readable image: {source}", path.display())]
+    Image {
+        /// The file.
+        path: PathBuf,
+        /// What the decoder said.
+        source: image::ImageError,
+    },
+    /// A field of a file does not hold what it must.
+    #[error("{}: {field}: expected {expected}, found {found}", path.display())]
+    Field {
+        /// The file.
+        path: PathBuf,
+        /// The field, with its line or row where there is one.
+        field: String,
+        /// What was expected.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+    /// A file that must exist does not.
+    #[error("{}: missing: {why}", path.display())]
+    Missing {
+        /// The file.
+        path: PathBuf,
+        /// Who needs it.
+        why: String,
+    },
+    /// An output exists already.
+    #[error("{}: exists already; nothing was overwritten", path.display())]
+    Exists {
+        /// The file or folder.
+        path: PathBuf,
+    },
+}
+
+/// Results of this crate.
+pub type Result<T> = std::result::Result<T, Error>;
+
+impl Error {
+    pub(crate) fn field(path: &Path, field: impl Into<String>, expected: impl ToString, found: impl ToString) -> Self {
+        Self::Field { path: path.into(), field: field.into(), expected: expected.to_string(), found: found.to_string() }
+    }
+}
+
+/// Attaches a path to errors of the standard library and of the image crate.
+pub(crate) trait At<T> {
+    fn at(self, path: &Path) -> Result<T>;
+}
+
+impl<T> At<T> for std::io::Result<T> {
+    fn at(self, path: &Path) -> Result<T> {
+        self.map_err(|source| Error::Io { path: path.into(), source })
+    }
+}
+
+impl<T> At<T> for image::ImageResult<T> {
+    fn at(self, path: &Path) -> Result<T> {
+        self.map_err(|source| match source {
+            image::ImageError::IoError(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
+                Error::Io { path: path.into(), source }
+            }
+            source => Error::Image { path: path.into(), source },
+        })
+    }
+}

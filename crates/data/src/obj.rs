@@ -1,0 +1,99 @@
+//! Wavefront OBJ with MTL materials and textures.
+
+use crate::error::{At, Error, Result};
+use crate::mesh::{Mesh, Part, Vertex};
+use glam::{Vec2, Vec3};
+use std::path::Path;
+
+/// Reads an OBJ file, its materials and its textures. Faces with indices out of range, materials and textures that cannot be
+/// read are left out and named in [`Mesh::warnings`]; a file without any face is an error. Normals are kept where the file has
+/// them, else flat; a textured surface takes its colour from the texture alone.
+pub fn load(path: &Path) -> Result<Mesh> {
+    let text = String::from_utf8_lossy(&std::fs::read(path).at(path)?).into_owned();
+    let mut mesh = Mesh::default();
+    let text = without_bad_faces(&text, &mut mesh.warnings);
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let material_warnings = std::cell::RefCell::new(vec![]);
+    let options = tobj::LoadOptions { single_index: true, triangulate: true, ignore_points: true, ignore_lines: true };
+    let (models, materials) = tobj::load_obj_buf(&mut text.as_bytes(), &options, |name| {
+        let loaded = std::fs::read(folder.join(name)).map_err(|e| e.to_string());
+        let loaded = loaded.and_then(|bytes| tobj::load_mtl_buf(&mut bytes.as_slice()).map_err(|e| e.to_string()));
+        Ok(loaded.unwrap_or_else(|error| {
+            material_warnings.borrow_mut().push(format!("{}: {error}", name.display()));
+            Default::default()
+        }))
+    })
+    .map_err(|error| Error::field(path, "OBJ", "a Wavefront OBJ file", error))?;
+    let materials = materials.unwrap_or_default();
+    mesh.warnings.extend(material_warnings.into_inner());
+
+    let mut textures = std::collections::HashMap::<&str, Option<usize>>::new();
+    for model in &models {
+        let shape = &model.mesh;
+        let material = shape.material_id.and_then(|id| materials.get(id));
+        let picture = material.and_then(|m| m.diffuse_texture.as_deref()).filter(|_| !shape.texcoords.is_empty());
+        let texture = picture.and_then(|name| {
+            *textures.entry(name).or_insert_with(|| match image::open(folder.join(name.replace('\\', "/"))) {
+                Ok(picture) => {
+                    mesh.textures.push(picture.into_rgba8());
+                    Some(mesh.textures.len() - 1)
+                }
+                Err(error) => {
+                    mesh.warnings.push(format!("{name}: {error}"));
+                    None
+                }
+            })
+        });
+        let plain = material.and_then(|m| m.diffuse).map_or(Vec3::splat(0.6), |[r, g, b]| Vec3::new(r, g, b));
+        let colour = if texture.is_some() { Vec3::ONE } else { plain };
+        let at = |values: &[f32], i: u32| values.get(3 * i as usize..).and_then(|v| v.get(..3)).map(Vec3::from_slice);
+        let start = mesh.vertices.len();
+        for triangle in shape.indices.chunks_exact(3) {
+            let before = mesh.vertices.len();
+            mesh.push_flat([0, 1, 2].map(|k| at(&shape.positions, triangle[k]).unwrap_or_default()), colour);
+            for (vertex, &i) in mesh.vertices[before..].iter_mut().zip(triangle) {
+                let normal = at(&shape.normals, i).unwrap_or_default().normalize_or_zero();
+                let uv = shape.texcoords.get(2 * i as usize..).and_then(|v| v.get(..2)).map(Vec2::from_slice);
+                // OBJ has v upwards.
+                let uv = uv.map_or(Vec2::ZERO, |uv| Vec2::new(uv.x, 1.0 - uv.y));
+                *vertex = Vertex { normal: if normal == Vec3::ZERO { vertex.normal } else { normal }, uv, ..*vertex };
+            }
+        }
+        mesh.parts.push(Part { vertices: start..mesh.vertices.len(), texture });
+    }
+    if mesh.vertices.is_empty() {
+        return Err(Error::field(path, "faces", "at least one", "none"));
+    }
+    Ok(mesh)
+}
+
+/// The text with every face taken out that refers to what the file does not have; tobj would refuse the whole file.
+fn without_bad_faces(text: &str, warnings: &mut Vec<String>) -> String {
+    let mut counts = [0i64; 3]; // v, vt, vn up to here: negative indices count back from them
+    let mut out = String::with_capacity(text.len());
+    let count_all = |key: &str| text.lines().filter(|line| line.split_whitespace().next() == Some(key)).count() as i64;
+    let totals = ["v", "vt", "vn"].map(count_all);
+    for (number, line) in text.lines().enumerate() {
+        let mut words = line.split_whitespace();
+        let good = match words.next() {
+            Some("v") => (counts[0] += 1, true).1,
+            Some("vt") => (counts[1] += 1, true).1,
+            Some("vn") => (counts[2] += 1, true).1,
+            Some("f") => words.take_while(|word| !word.starts_with('#')).all(|corner| {
+                corner.split('/').enumerate().all(|(k, index)| match index.parse::<i64>() {
+                    Ok(i) if i > 0 => k < 3 && i <= totals[k],
+                    Ok(i) if i < 0 => k < 3 && -i <= counts[k],
+                    _ => index.is_empty() && k > 0,
+                })
+            }),
+            _ => true,
+        };
+        if good {
+            out.push_str(line);
+        } else {
+            warnings.push(format!("line {}: face left out, index out of range: {}", number + 1, line.trim()));
+        }
+        out.push('\n');
+    }
+    out
+}

@@ -1,0 +1,134 @@
+//! Images as the network sees them: RGB in [-1, 1], square, area-resampled.
+
+use crate::error::{At, Result};
+use image::RgbImage;
+use std::path::Path;
+
+/// A float image: `data` is row-major `[height · width, 3]`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Pixels {
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// RGB triples in [-1, 1], row-major.
+    pub data: Vec<f32>,
+}
+
+impl Pixels {
+    /// Reads an image file of any colour type and depth; transparency is laid over white.
+    pub fn open(path: &Path) -> Result<Self> {
+        let rgba = image::ImageReader::open(path).at(path)?.with_guessed_format().at(path)?.decode().at(path)?.into_rgba32f();
+        let data = rgba.pixels().flat_map(|p| [0, 1, 2].map(|c| 2.0 * (p[c] * p[3] + (1.0 - p[3])) - 1.0)).collect();
+        Ok(Self { width: rgba.width() as usize, height: rgba.height() as usize, data })
+    }
+
+    /// The centred square, and how many columns and rows were cut off on the left and on top.
+    pub fn centre_square(&self) -> (Self, [usize; 2]) {
+        let side = self.width.min(self.height);
+        let [x0, y0] = [(self.width - side) / 2, (self.height - side) / 2];
+        let row = |y: usize| &self.data[3 * (y * self.width + x0)..][..3 * side];
+        (Self { width: side, height: side, data: (y0..y0 + side).flat_map(row).copied().collect() }, [x0, y0])
+    }
+
+    /// A `width × height` image in which each pixel is the mean of the area that it covers here.
+    pub fn area_resample(&self, width: usize, height: usize) -> Self {
+        if [width, height] == [self.width, self.height] {
+            return self.clone();
+        }
+        let across = resample_rows(&self.data, self.width, width);
+        let turned = transpose(&across, width, self.height);
+        let data = transpose(&resample_rows(&turned, self.height, height), height, width);
+        Self { width, height, data }
+    }
+
+    /// The image in 8 bits, rounded to nearest.
+    pub fn to_rgb8(&self) -> RgbImage {
+        rgb8(&self.data, self.width, self.height)
+    }
+}
+
+/// RGB triples in [-1, 1] as an 8-bit image, clamped and rounded to nearest. Missing pixels are black, surplus ones ignored.
+pub fn rgb8(data: &[f32], width: usize, height: usize) -> RgbImage {
+    let byte = |x: f32| ((x * 0.5 + 0.5).clamp(0.0, 1.0) * 255.0).round() as u8;
+    RgbImage::from_fn(width as u32, height as u32, |x, y| {
+        let at = 3 * (y as usize * width + x as usize);
+        image::Rgb([0, 1, 2].map(|c| data.get(at + c).map_or(0, |&v| byte(v))))
+    })
+}
+
+/// Each row of `from` pixels becomes `to` pixels; partly covered pixels count by their share.
+fn resample_rows(data: &[f32], from: usize, to: usize) -> Vec<f32> {
+    let step = from as f64 / to as f64;
+    let mut out = Vec::with_capacity(data.len() / from.max(1) * to);
+    for row in data.chunks_exact(3 * from) {
+        for i in 0..to {
+            let (start, end) = (i as f64 * step, (i + 1) as f64 * step);
+            let mut sum = [0.0f64; 3];
+            for k in start as usize..(end.ceil() as usize).min(from) {
+                let share = end.min(k as f64 + 1.0) - start.max(k as f64);
+                (0..3).for_each(|c| sum[c] += share * f64::from(row[3 * k + c]));
+            }
+            out.extend(sum.map(|s| (s / step) as f32));
+        }
+    }
+    out
+}
+
+fn transpose(data: &[f32], width: usize, height: usize) -> Vec<f32> {
+    let pixel = |i: usize| &data[3 * ((i % height) * width + i / height)..][..3];
+    (0..width * height).flat_map(pixel).copied().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grey(width: usize, height: usize, values: &[f32]) -> Pixels {
+        Pixels { width, height, data: values.iter().flat_map(|&v| [v; 3]).collect() }
+    }
+
+    #[test]
+    fn area_resample_takes_means() {
+        let half = grey(4, 2, &[0.0, 1.0, 0.5, 0.5, 1.0, 0.0, -1.0, 0.0]).area_resample(2, 1);
+        assert_eq!(half, grey(2, 1, &[0.5, 0.0]));
+        // 3 → 2: each new pixel covers one and a half old ones.
+        let thirds = grey(3, 1, &[0.0, 0.6, 0.9]).area_resample(2, 1);
+        let expected = [0.3 / 1.5, (0.3 + 0.9) / 1.5];
+        assert!(thirds.data.iter().step_by(3).zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{thirds:?}");
+        let column = grey(1, 3, &[0.0, 0.6, 0.9]).area_resample(1, 2);
+        assert_eq!(column.data, thirds.data);
+        let same = grey(2, 2, &[0.1, 0.2, 0.3, 0.4]);
+        assert_eq!(same.area_resample(2, 2), same);
+    }
+
+    #[test]
+    fn channels_stay_apart() {
+        let image = Pixels { width: 2, height: 1, data: vec![1.0, 0.0, -1.0, 0.0, 1.0, -1.0] };
+        assert_eq!(image.area_resample(1, 1).data, [0.5, 0.5, -1.0]);
+    }
+
+    #[test]
+    fn the_square_is_centred() {
+        let (square, cut) = grey(4, 2, &[0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]).centre_square();
+        assert_eq!((square, cut), (grey(2, 2, &[0.1, 0.2, 0.5, 0.6]), [1, 0]));
+    }
+
+    #[test]
+    fn every_colour_type_is_read_and_transparency_is_white() {
+        let dir = std::env::temp_dir().join(format!("srn-data-pixels-{}", std::process::id()));
+        std::fs::create_dir_all(&dir).unwrap();
+        let cases: [(&str, image::DynamicImage, [f32; 3]); 3] = [
+            ("grey", image::GrayImage::from_pixel(2, 2, image::Luma([51])).into(), [-0.6; 3]),
+            ("deep", image::ImageBuffer::from_pixel(2, 2, image::Rgb([0u16, 65535, 13107])).into(), [-1.0, 1.0, -0.6]),
+            ("alpha", image::RgbaImage::from_pixel(2, 2, image::Rgba([0, 0, 255, 51])).into(), [0.6, 0.6, 1.0]),
+        ];
+        for (name, picture, expected) in cases {
+            let path = dir.join(name).with_extension("png");
+            picture.save(&path).unwrap();
+            let read = Pixels::open(&path).unwrap();
+            assert!(read.data[..3].iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{name}: {:?}", &read.data[..3]);
+        }
+        std::fs::remove_dir_all(dir).unwrap();
+    }
+}

@@ -1,0 +1,282 @@
+//! The folder layout of the SRN data sets:
+//! `<set>/<instance>/{rgb/*.png, pose/*.txt, intrinsics.txt}`.
+//!
+//! A pose file holds the 4×4 `world_from_camera`, row-major, in any line breaks. `intrinsics.txt` holds
+//! `f cx cy 0.`, the grid's barycentre `0. 0. 0.`, the near plane `1.` and `height width`, in that order.
+
+use crate::camera::rigid_error;
+use crate::error::{At, Error, Result};
+use crate::pixels::Pixels;
+use glam::DMat4;
+use image::RgbImage;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The largest rigid error of a pose that is still read (poses in six decimals, or stored as f32, lie far below).
+pub const RIGID_TOLERANCE: f64 = 1e-3;
+
+/// A data set on disk: names and files; pictures are read by [`SrnSet::load`].
+#[derive(Debug, Clone)]
+pub struct SrnSet {
+    /// The folder that was opened.
+    pub dir: PathBuf,
+    /// The instances, sorted by name; at least one.
+    pub instances: Vec<InstanceFiles>,
+}
+
+/// The files of one instance.
+#[derive(Debug, Clone)]
+pub struct InstanceFiles {
+    /// The folder's name.
+    pub name: String,
+    /// The folder.
+    pub dir: PathBuf,
+    /// The views, sorted by name.
+    pub views: Vec<ViewFiles>,
+}
+
+/// The files of one view; an instance in order has both.
+#[derive(Debug, Clone)]
+pub struct ViewFiles {
+    /// The file name without its extension.
+    pub name: String,
+    /// The picture.
+    pub rgb: Option<PathBuf>,
+    /// The pose.
+    pub pose: Option<PathBuf>,
+}
+
+/// The content of `intrinsics.txt`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Intrinsics {
+    /// Focal length in pixels, the same along x and y.
+    pub focal: f64,
+    /// Principal point `[cx, cy]` in pixels.
+    pub centre: [f64; 2],
+    /// Image width and height, in pixels, that the values above belong to.
+    pub size: [usize; 2],
+}
+
+/// A data set in memory, every picture square and of the same side.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Dataset {
+    /// Width and height of every picture in pixels.
+    pub side: usize,
+    /// The instances, sorted by name.
+    pub instances: Vec<Instance>,
+}
+
+/// One object and its views.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Instance {
+    /// The folder's name.
+    pub name: String,
+    /// The views, sorted by name.
+    pub views: Vec<LoadedView>,
+}
+
+/// One picture and its camera.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoadedView {
+    /// The file name without its extension.
+    pub name: String,
+    /// RGB in [-1, 1], row-major `[side · side, 3]`.
+    pub rgb: Vec<f32>,
+    /// 4×4, row-major: camera axes x right, y down, z forward to the world; the last column is the camera centre.
+    pub world_from_camera: [f64; 16],
+    /// `fx, fy, cx, cy` in pixels of this picture; integer coordinates are pixel centres.
+    pub intrinsics: [f32; 4],
+}
+
+impl SrnSet {
+    /// Lists a data set, or a single instance, without reading the pictures. Views whose picture or pose is missing are
+    /// listed too; [`SrnSet::load`] refuses them.
+    ///
+    /// Fails if the folder cannot be read or holds no instance (a folder with `rgb/` or `pose/` in it).
+    pub fn open(dir: impl AsRef<Path>) -> Result<Self> {
+        let dir = dir.as_ref();
+        let is_instance = |path: &Path| path.join("rgb").is_dir() || path.join("pose").is_dir();
+        let mut folders = vec![];
+        if is_instance(dir) {
+            folders.push(std::fs::canonicalize(dir).at(dir)?);
+        } else {
+            for entry in std::fs::read_dir(dir).at(dir)? {
+                folders.push(entry.at(dir)?.path());
+            }
+            folders.retain(|path| is_instance(path));
+            folders.sort();
+        }
+        if folders.is_empty() {
+            return Err(Error::field(dir, "folder", "instances, each with rgb/ and pose/", "none"));
+        }
+        let instances = folders.into_iter().map(InstanceFiles::open).collect::<Result<_>>()?;
+        Ok(Self { dir: dir.into(), instances })
+    }
+
+    /// Reads everything as squares of `side` pixels: the centre square, resampled by area.
+    pub fn load(&self, side: usize) -> Result<Dataset> {
+        let instances = self.instances.iter().map(|instance| instance.load(side)).collect::<Result<_>>()?;
+        Ok(Dataset { side, instances })
+    }
+}
+
+impl InstanceFiles {
+    fn open(dir: PathBuf) -> Result<Self> {
+        let mut views = BTreeMap::<String, [Option<PathBuf>; 2]>::new();
+        for (slot, (folder, extensions)) in [("rgb", &["png", "jpg", "jpeg"][..]), ("pose", &["txt"])].into_iter().enumerate() {
+            let folder = dir.join(folder);
+            for entry in std::fs::read_dir(&folder).at(&folder)? {
+                let path = entry.at(&folder)?.path();
+                let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+                if extensions.contains(&extension.as_str()) {
+                    let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+                    views.entry(name).or_default()[slot] = Some(path);
+                }
+            }
+        }
+        let name = dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let views = views.into_iter().map(|(name, [rgb, pose])| ViewFiles { name, rgb, pose }).collect();
+        Ok(Self { name, dir, views })
+    }
+
+    /// Reads the instance's views as squares of `side` pixels.
+    pub fn load(&self, side: usize) -> Result<Instance> {
+        let intrinsics = Intrinsics::read(&self.dir.join("intrinsics.txt"))?;
+        if self.views.is_empty() {
+            return Err(Error::field(&self.dir, "rgb/", "pictures", "none"));
+        }
+        let views = self.views.iter().map(|view| view.load(&self.dir, &intrinsics, side)).collect::<Result<_>>()?;
+        Ok(Instance { name: self.name.clone(), views })
+    }
+}
+
+impl ViewFiles {
+    fn load(&self, dir: &Path, intrinsics: &Intrinsics, side: usize) -> Result<LoadedView> {
+        let missing = |folder: &str, extension: &str, other: &Option<PathBuf>| Error::Missing {
+            path: dir.join(folder).join(&self.name).with_extension(extension),
+            why: format!("{} needs it", other.as_deref().unwrap_or(dir).display()),
+        };
+        let rgb = self.rgb.as_ref().ok_or_else(|| missing("rgb", "png", &self.pose))?;
+        let pose = self.pose.as_ref().ok_or_else(|| missing("pose", "txt", &self.rgb))?;
+        let world_from_camera = read_pose(pose)?;
+        let (pixels, intrinsics) = load_square(rgb, intrinsics, side)?;
+        let world_from_camera = world_from_camera.transpose().to_cols_array();
+        Ok(LoadedView { name: self.name.clone(), rgb: pixels.data, world_from_camera, intrinsics })
+    }
+}
+
+/// Reads one picture as a square of `side` pixels, and the `[fx, fy, cx, cy]` that belong to it: the crop shifts the principal
+/// point, the resampling scales all four by `side / height` (as SRN does; the half-pixel shift of pixel centres that remains at
+/// other sizes is the convention's, not corrected here).
+pub fn load_square(path: &Path, intrinsics: &Intrinsics, side: usize) -> Result<(Pixels, [f32; 4])> {
+    let image = Pixels::open(path)?;
+    let [width, height] = intrinsics.size;
+    if image.width * height != image.height * width {
+        let found = format!("{}×{}", image.width, image.height);
+        return Err(Error::field(path, "size", format!("the aspect of intrinsics.txt, {width}×{height}"), found));
+    }
+    let (square, cut) = image.centre_square();
+    let file_scale = image.width as f64 / width as f64;
+    let scale = side as f64 / square.width as f64;
+    let focal = intrinsics.focal * file_scale * scale;
+    let centre = [0, 1].map(|i| (intrinsics.centre[i] * file_scale - cut[i] as f64) * scale);
+    Ok((square.area_resample(side, side), [focal, focal, centre[0], centre[1]].map(|x| x as f32)))
+}
+
+/// Reads a pose file: 16 numbers, a rigid `world_from_camera`.
+pub fn read_pose(path: &Path) -> Result<DMat4> {
+    let pose = read_pose_unchecked(path)?;
+    match rigid_error(&pose) {
+        error if error <= RIGID_TOLERANCE => Ok(pose),
+        error if error >= 2.0 => Err(Error::field(path, "rotation", "a right-handed rotation", "a mirrored or scaled one")),
+        error => Err(Error::field(path, "pose", format!("a rigid motion within {RIGID_TOLERANCE}"), format!("{error:.3} off"))),
+    }
+}
+
+/// Reads a pose file: 16 finite numbers, no more is asked of them.
+pub(crate) fn read_pose_unchecked(path: &Path) -> Result<DMat4> {
+    let text = std::fs::read_to_string(path).at(path)?;
+    let values = numbers(path, "pose", &text)?;
+    let rows: [f64; 16] = values.as_slice().try_into().map_err(|_| Error::field(path, "pose", "16 numbers", values.len()))?;
+    Ok(DMat4::from_cols_array(&rows).transpose())
+}
+
+fn numbers(path: &Path, field: &str, text: &str) -> Result<Vec<f64>> {
+    let number = |word: &str| match word.parse() {
+        Ok(x) if f64::is_finite(x) => Ok(x),
+        _ => Err(Error::field(path, field, "finite numbers", format!("\"{word}\""))),
+    };
+    text.split_whitespace().map(number).collect()
+}
+
+impl Intrinsics {
+    /// Reads `intrinsics.txt`.
+    pub fn read(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path).at(path)?;
+        let lines: Vec<_> = text.lines().filter(|line| !line.trim().is_empty()).collect();
+        let line = |i: usize, field: &str, at_least: usize| {
+            let values = numbers(path, field, lines.get(i).copied().unwrap_or_default())?;
+            let expected = || format!("{at_least} numbers in line {}", i + 1);
+            if values.len() < at_least { Err(Error::field(path, field, expected(), values.len())) } else { Ok(values) }
+        };
+        let camera = line(0, "f cx cy", 3)?;
+        let size = line(3, "height width", 2)?;
+        if camera[0] <= 0.0 {
+            return Err(Error::field(path, "f", "a positive focal length", camera[0]));
+        }
+        if size.iter().any(|&s| s < 1.0 || s.fract() != 0.0) {
+            return Err(Error::field(path, "height width", "positive whole numbers", format!("{size:?}")));
+        }
+        Ok(Self { focal: camera[0], centre: [camera[1], camera[2]], size: [size[1] as usize, size[0] as usize] })
+    }
+}
+
+impl std::fmt::Display for Intrinsics {
+    /// The text of `intrinsics.txt`.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { focal, centre: [cx, cy], size: [width, height] } = self;
+        writeln!(f, "{focal:?} {cx:?} {cy:?} 0.\n0. 0. 0.\n1.\n{height} {width}")
+    }
+}
+
+/// Writes one instance folder, view by view.
+#[derive(Debug)]
+pub struct InstanceWriter {
+    dir: PathBuf,
+}
+
+impl InstanceWriter {
+    /// Makes `dir` with its `intrinsics.txt`. If `dir` exists it is refused, or, with `replace`, its pictures and poses are
+    /// removed; files of other kinds stay.
+    pub fn create(dir: impl Into<PathBuf>, intrinsics: &Intrinsics, replace: bool) -> Result<Self> {
+        let dir = dir.into();
+        if dir.exists() {
+            if !replace {
+                return Err(Error::Exists { path: dir });
+            }
+            for view in InstanceFiles::open(dir.clone()).map(|files| files.views).unwrap_or_default() {
+                for path in [view.rgb, view.pose].into_iter().flatten() {
+                    std::fs::remove_file(&path).at(&path)?;
+                }
+            }
+        }
+        for folder in ["rgb", "pose"].map(|name| dir.join(name)) {
+            std::fs::create_dir_all(&folder).at(&folder)?;
+        }
+        let path = dir.join("intrinsics.txt");
+        std::fs::write(&path, intrinsics.to_string()).at(&path)?;
+        Ok(Self { dir })
+    }
+
+    /// Writes `rgb/<name>.png` and `pose/<name>.txt`.
+    pub fn add(&self, name: &str, rgb: &RgbImage, world_from_camera: &DMat4) -> Result<()> {
+        let path = self.dir.join("rgb").join(name).with_extension("png");
+        let file = std::io::BufWriter::new(std::fs::File::create(&path).at(&path)?);
+        // The best compression: data sets are written once and kept.
+        let (kind, filter) = (image::codecs::png::CompressionType::Best, image::codecs::png::FilterType::Adaptive);
+        rgb.write_with_encoder(image::codecs::png::PngEncoder::new_with_quality(file, kind, filter)).at(&path)?;
+        let path = self.dir.join("pose").join(name).with_extension("txt");
+        let row = |r: usize| world_from_camera.row(r).to_array().map(|x| format!("{x:.9}")).join(" ");
+        std::fs::write(&path, [0, 1, 2, 3].map(row).join("\n") + "\n").at(&path)
+    }
+}
