@@ -7,7 +7,7 @@ fn sigmoid(x: f32) -> f32 {
 // (coefficients of Cephes' tanhf), 1 - 2 / (e^2|x| + 1) further out, which is 1 beyond 15.
 fn stable_tanh(x: f32) -> f32 {
     let a = min(abs(x), 15.0);
-    let z = x * x;
+    let z = a * a;
     let p = (((-5.70498872745e-3 * z + 2.06390887954e-2) * z - 5.37397155531e-2) * z + 1.33314422036e-1) * z - 3.33332819422e-1;
     return select(sign(x) * (1.0 - 2.0 / (exp(2.0 * a) + 1.0)), x + x * z * p, a < 0.625);
 }

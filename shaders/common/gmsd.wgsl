@@ -1,4 +1,4 @@
-// Prewitt responses (x: right minus left, y: below minus above) at the centre of a 3×3 patch; patch[column][row].
+// Prewitt responses (x: right minus left, y: below minus above) at the centre of a 3×3 window; window[column][row].
 fn prewitt(window: mat3x3<f32>) -> vec2<f32> {
     let across = window[2] - window[0];
     let down = window[0] + window[1] + window[2];
@@ -15,7 +15,8 @@ fn gmsd_quality(a: f32, b: f32) -> f32 {
     return (2.0 * a * b + GMSD_C) / (a * a + b * b + GMSD_C);
 }
 
-// Index of the neighbour (i, j) of a pixel in images of `size` (width, height), (1, 1) being the pixel itself.
+// Index of the neighbour (i, j) of a pixel in images of `size` (width, height), (1, 1) being the pixel itself; OUTSIDE beyond
+// the edge.
 const OUTSIDE: u32 = 0xffffffffu;
 
 fn neighbour(index: u32, size: vec2<u32>, i: u32, j: u32) -> u32 {

@@ -31,10 +31,12 @@ fn weights_of(group: u32) -> u32 {
     return slots[params.first_group + group] * params.weight_stride;
 }
 
+// Four rows of x, as columns.
 fn x_columns(row: vec4<u32>, i: u32) -> mat4x4<f32> {
     return mat4x4(x[row.x + i], x[row.y + i], x[row.z + i], x[row.w + i]);
 }
 
+// Four rows of W, as columns.
 fn w_columns(row: vec4<u32>, i: u32) -> mat4x4<f32> {
     return mat4x4(weights[row.x + i], weights[row.y + i], weights[row.z + i], weights[row.w + i]);
 }
@@ -67,7 +69,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     if (row >= params.rows_per_group || out >= params.out_features || group >= params.groups) {
         return;
     }
-    // Beginnings of the rows of x and W, in vectors; beyond the last row it is read again and not stored.
+    // Where the rows of x and W begin, in vectors; the last one stands in for those beyond it, which are not stored.
     let n = params.in_features / 4u;
     let lane = vec4(0u, 1u, 2u, 3u);
     let x_last = vec4(params.rows_per_group - 1u);
