@@ -82,7 +82,7 @@ pub fn off_axis_deg(world_from_camera: &DMat4) -> f64 {
 }
 
 /// The focal length in pixels at which the sphere of radius 0.5 around the origin (it holds every unit-diagonal object) just
-/// fits into a square image of `side` pixels with one pixel to spare, seen from `radius`.
+/// fits into a square image of `side` pixels, seen from `radius` by a camera with its principal point at `side / 2`.
 pub fn fitting_focal_px(side: usize, radius: f64) -> f64 {
     let half_angle = (0.5 / radius).min(0.99).asin();
     (side as f64 / 2.0 - 1.0) / half_angle.tan()

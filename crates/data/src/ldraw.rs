@@ -136,3 +136,78 @@ fn hex_colour(hex: &str) -> Option<Vec3> {
 pub fn name_hash(name: &str) -> u64 {
     name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::write;
+
+    const CONFIG: &str = "0 !COLOUR Red CODE 4 VALUE #FF0000 EDGE #330000\n0 !COLOUR Blue CODE 1 VALUE #0000FF EDGE #000033\n";
+    const RED: Vec3 = Vec3::new(1., 0., 0.);
+    const DARK_RED: Vec3 = Vec3::new(0.2, 0., 0.);
+    const BLUE: Vec3 = Vec3::new(0., 0., 1.);
+    const DARK_BLUE: Vec3 = Vec3::new(0., 0., 0.2);
+
+    /// A library with the given part, and a sub-file with a surface that inherits, one of the edge colour and a red one.
+    fn load(part: &str, main_colour: u32) -> Result<Mesh> {
+        let dir = tempfile::tempdir().unwrap();
+        for folder in ["parts/s", "p"] {
+            std::fs::create_dir_all(dir.path().join(folder)).unwrap();
+        }
+        write(dir.path().join("LDConfig.ldr"), CONFIG).unwrap();
+        write(dir.path().join("parts/s/sub.dat"), "3 16 0 0 0 1 0 0 0 1 0\n3 24 0 0 0 1 0 0 0 1 0\n3 4 0 0 0 1 0 0 0 1 0\n")
+            .unwrap();
+        write(dir.path().join("p/loop.dat"), "1 16 0 0 0 1 0 0 0 1 0 0 0 1 loop.dat\n").unwrap();
+        let path = dir.path().join("parts/part.dat");
+        write(&path, part).unwrap();
+        Library::of_part(&path)?.load(&path, Some(main_colour))
+    }
+
+    fn colours(part: &str, main_colour: u32) -> Vec<Vec3> {
+        load(part, main_colour).unwrap().vertices.chunks(3).map(|corners| corners[0].colour).collect()
+    }
+
+    #[test]
+    fn colours_are_inherited_through_files() {
+        let place = |colour: &str| format!("0 A part\n1 {colour} 0 0 0 1 0 0 0 1 0 0 0 1 S\\SUB.DAT\n");
+        assert_eq!(colours(&place("16"), 1), [BLUE, DARK_BLUE, RED], "the main colour reaches the sub-file");
+        assert_eq!(colours(&place("4"), 1), [RED, DARK_RED, RED], "the placing line's colour wins over the main one");
+        assert_eq!(colours(&place("24"), 1), [DARK_BLUE, DARK_BLUE, RED], "the edge colour of the main one");
+        assert_eq!(colours("3 0x20000FF 0 0 0 1 0 0 0 1 0", 4), [BLUE], "a direct colour");
+        assert_eq!(colours("4 16 0 0 0 1 0 0 1 1 0 0 1 0\n2 24 0 0 0 1 1 1\n5 24 0 0 0 1 1 1 2 2 2 3 3 3", 4), [RED, RED]);
+    }
+
+    #[test]
+    fn sub_files_are_placed_by_rows() {
+        // x' = 10 + 2·y, y' = 20 + 3·z, z' = 30 + 4·x
+        let mesh = load("1 16 10 20 30 0 2 0 0 0 3 4 0 0 s/sub.dat", 4).unwrap();
+        let corners = [0, 1, 2].map(|i| mesh.vertices[i].position.to_array());
+        assert_eq!(corners, [[10., 20., 30.], [10., 20., 34.], [12., 20., 30.]]);
+    }
+
+    #[test]
+    fn bad_parts_are_named() {
+        let cases = [
+            ("1 16 0 0 0 1 0 0 0 1 0 0 0 1 none.dat", "none.dat"),
+            ("1 16 0 0 0 1 0 0 0 1 0 0 0 1 loop.dat", "nested"),
+            ("3 16 0 0 0 1 0 0 0 1", "line 1"),
+            ("3 16 0 0 0 1 0 0 0 1 x", "line 1"),
+            ("0 fine\n3 99 0 0 0 1 0 0 0 1 0", "line 2"),
+            ("0 nothing here", "triangle"),
+        ];
+        for (part, word) in cases {
+            let error = load(part, 4).unwrap_err().to_string();
+            assert!(error.contains(word), "{part}: {error}");
+        }
+        assert!(load("3 16 0 0 0 1 0 0 0 1 0", 77).unwrap_err().to_string().contains("77"));
+        let error = Library::of_part(Path::new("/parts/3001.dat")).unwrap_err().to_string();
+        assert!(error.contains("LDConfig.ldr"), "{error}");
+    }
+
+    #[test]
+    fn the_name_decides_the_colour_for_ever() {
+        // Published values of FNV-1a, 64 bits.
+        assert_eq!(name_hash(""), 0xcbf29ce484222325);
+        assert_eq!(name_hash("foobar"), 0x85944171f73967e8);
+    }
+}

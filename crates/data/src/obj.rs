@@ -97,3 +97,58 @@ fn without_bad_faces(text: &str, warnings: &mut Vec<String>) -> String {
     }
     out
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::write;
+
+    /// Two squares in the plane z = 0: the first red, the second textured.
+    const OBJ: &str = "mtllib my things.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n\
+        usemtl red\nf 1 2 3 4\nusemtl wood\nf 1/1 2/2 3/3 4/4\n";
+    const MTL: &str = "newmtl red\nKd 1 0.25 0\n\nnewmtl wood\nKd 0.1 0.1 0.1\nmap_Kd old oak.png\n";
+
+    fn loaded(obj: &str) -> Result<Mesh> {
+        let dir = tempfile::tempdir().unwrap();
+        write(dir.path().join("my things.mtl"), MTL).unwrap();
+        image::RgbImage::from_pixel(2, 1, image::Rgb([7, 8, 9])).save(dir.path().join("old oak.png")).unwrap();
+        write(dir.path().join("mesh.obj"), obj).unwrap();
+        load(&dir.path().join("mesh.obj"))
+    }
+
+    #[test]
+    fn colours_textures_and_coordinates() {
+        let mesh = loaded(OBJ).unwrap();
+        assert!(mesh.warnings.is_empty(), "{:?}", mesh.warnings);
+        assert_eq!(mesh.parts, [Part { vertices: 0..6, texture: None }, Part { vertices: 6..12, texture: Some(0) }]);
+        assert_eq!(mesh.textures[0].as_raw(), &[7, 8, 9, 255, 7, 8, 9, 255]);
+        assert!(mesh.vertices[..6].iter().all(|v| v.colour == Vec3::new(1.0, 0.25, 0.0) && v.normal == Vec3::Z));
+        // Textures are not darkened by Kd; v points down.
+        assert!(mesh.vertices[6..].iter().all(|v| v.colour == Vec3::ONE && v.uv == Vec2::new(v.position.x, 1.0 - v.position.y)));
+    }
+
+    #[test]
+    fn faces_with_bad_indices_are_left_out() {
+        for bad in ["f 1 2 5", "f 1 2 0", "f -5 -1 -2", "f 1/9 2/1 3/1", "f 1//1 2//1 3//1", "f 1 2 x"] {
+            let mesh = loaded(&format!("{OBJ}{bad}\n")).unwrap();
+            assert_eq!(mesh.vertices.len(), 12, "{bad}");
+            assert!(mesh.warnings.len() == 1 && mesh.warnings[0].contains("line 14") && mesh.warnings[0].contains(bad), "{bad}");
+        }
+        let mesh = loaded(&format!("{OBJ}f -4 -3 -2\n")).unwrap();
+        assert_eq!((mesh.vertices.len(), mesh.warnings.len()), (15, 0), "a face that counts back from the end is good");
+        let error = loaded("v 0 0 0\nf 1 2 3\n").unwrap_err().to_string();
+        assert!(error.contains("mesh.obj") && error.contains("faces"), "{error}");
+    }
+
+    #[test]
+    fn missing_materials_and_textures_are_warnings() {
+        let mesh = loaded(&OBJ.replace("my things", "lost")).unwrap();
+        assert!(mesh.vertices.len() == 12 && mesh.warnings[0].contains("lost.mtl"), "{:?}", mesh.warnings);
+        let dir = tempfile::tempdir().unwrap();
+        write(dir.path().join("my things.mtl"), MTL).unwrap();
+        write(dir.path().join("mesh.obj"), OBJ).unwrap();
+        let mesh = load(&dir.path().join("mesh.obj")).unwrap();
+        assert!(mesh.textures.is_empty() && mesh.warnings[0].contains("old oak.png"), "{:?}", mesh.warnings);
+        assert_eq!(mesh.vertices[6].colour, Vec3::splat(0.1), "without its texture a surface has its own colour");
+    }
+}

@@ -116,19 +116,17 @@ mod tests {
 
     #[test]
     fn every_colour_type_is_read_and_transparency_is_white() {
-        let dir = std::env::temp_dir().join(format!("srn-data-pixels-{}", std::process::id()));
-        std::fs::create_dir_all(&dir).unwrap();
+        let dir = tempfile::tempdir().unwrap();
         let cases: [(&str, image::DynamicImage, [f32; 3]); 3] = [
             ("grey", image::GrayImage::from_pixel(2, 2, image::Luma([51])).into(), [-0.6; 3]),
             ("deep", image::ImageBuffer::from_pixel(2, 2, image::Rgb([0u16, 65535, 13107])).into(), [-1.0, 1.0, -0.6]),
             ("alpha", image::RgbaImage::from_pixel(2, 2, image::Rgba([0, 0, 255, 51])).into(), [0.6, 0.6, 1.0]),
         ];
         for (name, picture, expected) in cases {
-            let path = dir.join(name).with_extension("png");
+            let path = dir.path().join(name).with_extension("png");
             picture.save(&path).unwrap();
             let read = Pixels::open(&path).unwrap();
             assert!(read.data[..3].iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{name}: {:?}", &read.data[..3]);
         }
-        std::fs::remove_dir_all(dir).unwrap();
     }
 }

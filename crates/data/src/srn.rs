@@ -280,3 +280,130 @@ impl InstanceWriter {
         std::fs::write(&path, [0, 1, 2, 3].map(row).join("\n") + "\n").at(&path)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::uniform_sphere;
+    use std::fs::write;
+
+    const INTRINSICS: Intrinsics = Intrinsics { focal: 74.4, centre: [4.0, 4.0], size: [8, 8] };
+
+    /// A set of one instance, its poses and pictures.
+    fn made(views: usize) -> (tempfile::TempDir, Vec<DMat4>, Vec<RgbImage>) {
+        let dir = tempfile::tempdir().unwrap();
+        let poses = uniform_sphere(views, 1.3, 1);
+        let pictures: Vec<_> = (0..views as u32)
+            .map(|k| RgbImage::from_fn(8, 8, |x, y| image::Rgb([(x * 30 + k) as u8, (y * 30) as u8, (x * y) as u8])))
+            .collect();
+        let writer = InstanceWriter::create(dir.path().join("thing"), &INTRINSICS, false).unwrap();
+        for (i, (pose, picture)) in poses.iter().zip(&pictures).enumerate() {
+            writer.add(&format!("{i:06}"), picture, pose).unwrap();
+        }
+        (dir, poses, pictures)
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let (dir, poses, pictures) = made(12);
+        let set = SrnSet::open(dir.path()).unwrap().load(8).unwrap();
+        let [instance] = &set.instances[..] else { panic!("{} instances", set.instances.len()) };
+        assert_eq!((instance.name.as_str(), instance.views.len()), ("thing", 12));
+        for ((view, pose), picture) in instance.views.iter().zip(&poses).zip(&pictures) {
+            let rows = pose.transpose().to_cols_array();
+            assert!(view.world_from_camera.iter().zip(rows).all(|(a, b)| (a - b).abs() < 1e-6), "{}", view.name);
+            assert_eq!(view.intrinsics, [74.4, 74.4, 4.0, 4.0]);
+            assert_eq!(crate::pixels::rgb8(&view.rgb, 8, 8), *picture);
+        }
+        // The last column is the camera centre, 1.3 away; a transposed pose would have zeros there.
+        let m = set.instances[0].views[0].world_from_camera;
+        assert!((m[3].hypot(m[7]).hypot(m[11]) - 1.3).abs() < 1e-6);
+        // A single instance is a set as well.
+        assert_eq!(SrnSet::open(dir.path().join("thing")).unwrap().load(8).unwrap(), set);
+    }
+
+    #[test]
+    fn intrinsics_follow_crop_and_size() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("wide.png");
+        RgbImage::from_pixel(24, 16, image::Rgb([0, 255, 0])).save(&path).unwrap();
+        // The file's values are for twice the picture's size.
+        let intrinsics = Intrinsics { focal: 60.0, centre: [25.0, 14.0], size: [48, 32] };
+        let (pixels, values) = load_square(&path, &intrinsics, 8).unwrap();
+        assert_eq!((pixels.width, pixels.height), (8, 8));
+        assert_eq!(values, [15.0, 15.0, (12.5 - 4.0) / 2.0, 3.5]);
+        let error = load_square(&path, &INTRINSICS, 8).unwrap_err().to_string();
+        assert!(error.contains("wide.png") && error.contains("8×8") && error.contains("24×16"), "{error}");
+    }
+
+    #[test]
+    fn poses_are_read_in_any_line_breaks() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("pose.txt");
+        write(&path, "0 0 1 -2  1 0 0 0\t0 -1 0 0 0 0 0 1").unwrap();
+        let pose = read_pose(&path).unwrap_err().to_string();
+        assert!(pose.contains("right-handed"), "{pose}");
+        write(&path, "0 0 1 -2\n-1 0 0 0\n0 -1 0 0\n0 0 0 1\n").unwrap();
+        assert_eq!(read_pose(&path).unwrap().w_axis.to_array(), [-2.0, 0.0, 0.0, 1.0]);
+    }
+
+    /// Breaks one file of a good set; the error must name that file and hold the given words.
+    fn broken(file: &str, spoil: impl Fn(&Path), words: &[&str]) {
+        let (dir, ..) = made(3);
+        let path = dir.path().join("thing").join(file);
+        spoil(&path);
+        let error = SrnSet::open(dir.path()).and_then(|set| set.load(8)).map(|_| ()).unwrap_err().to_string();
+        let named = Path::new(file).file_name().unwrap().to_str().unwrap();
+        assert!(error.contains(named) && words.iter().all(|word| error.contains(word)), "{error}");
+        assert!(!error.contains('\n'), "{error}");
+    }
+
+    #[test]
+    fn bad_files_are_named() {
+        let remove = |path: &Path| std::fs::remove_file(path).unwrap();
+        let text = |text: &'static str| move |path: &Path| write(path, text).unwrap();
+        let halve = |path: &Path| write(path, &std::fs::read(path).unwrap()[..60]).unwrap();
+        broken("pose/000001.txt", remove, &["missing", "rgb"]);
+        broken("rgb/000001.png", remove, &["missing", "pose"]);
+        broken("intrinsics.txt", remove, &[]);
+        broken("rgb/000002.png", halve, &["not a readable image"]);
+        broken("rgb/000002.png", text("no picture"), &["not a readable image"]);
+        broken("pose/000000.txt", text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0"), &["16 numbers", "15"]);
+        broken("pose/000000.txt", text("1 0 0 0 0 1 0 0 0 0 1 NaN 0 0 0 1"), &["finite", "NaN"]);
+        broken("pose/000000.txt", text("1 0 0 0 0 1 0 0 0 0 1 x 0 0 0 1"), &["\"x\""]);
+        broken("pose/000000.txt", text("1.1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"), &["rigid", "0.210"]);
+        broken("pose/000000.txt", text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 2"), &["rigid"]);
+        broken("intrinsics.txt", text("50 4\n0 0 0\n1\n8 8\n"), &["f cx cy", "3 numbers", "2"]);
+        broken("intrinsics.txt", text("50 4 4\n0 0 0\n1\n"), &["height width"]);
+        broken("intrinsics.txt", text("-50 4 4\n0 0 0\n1\n8 8"), &["positive", "-50"]);
+        broken("intrinsics.txt", text("50 4 4\n0 0 0\n1\n8 0"), &["positive"]);
+    }
+
+    #[test]
+    fn folders_without_a_set_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let error = |path: &Path| SrnSet::open(path).unwrap_err().to_string();
+        assert!(error(dir.path()).contains("rgb/"));
+        assert!(error(&dir.path().join("nowhere")).contains("nowhere"));
+        for folder in ["rgb", "pose"] {
+            std::fs::create_dir_all(dir.path().join("empty").join(folder)).unwrap();
+        }
+        write(dir.path().join("empty/intrinsics.txt"), INTRINSICS.to_string()).unwrap();
+        let error = SrnSet::open(dir.path()).unwrap().load(8).unwrap_err().to_string();
+        assert!(error.contains("empty") && error.contains("none"), "{error}");
+    }
+
+    #[test]
+    fn nothing_is_overwritten_unasked() {
+        let (dir, _, pictures) = made(3);
+        let thing = dir.path().join("thing");
+        let notes = thing.join("notes.txt");
+        write(&notes, "mine").unwrap();
+        assert!(matches!(InstanceWriter::create(&thing, &INTRINSICS, false), Err(Error::Exists { .. })));
+        assert_eq!(SrnSet::open(&thing).unwrap().instances[0].views.len(), 3);
+        let writer = InstanceWriter::create(&thing, &INTRINSICS, true).unwrap();
+        writer.add("new", &pictures[0], &uniform_sphere(1, 1.0, 0)[0]).unwrap();
+        assert_eq!(SrnSet::open(&thing).unwrap().instances[0].views.len(), 1, "old views stayed");
+        assert_eq!(std::fs::read_to_string(notes).unwrap(), "mine");
+    }
+}

@@ -2,8 +2,12 @@
 //!
 //! Every picture is drawn four times as wide and high with four samples a pixel, then averaged: 64 samples a pixel.
 
-use bytemuck::{Pod, Zeroable};
 use std::ops::Range;
+
+use bytemuck::{Pod, Zeroable};
+use srn_plan::ExecutorError;
+
+use crate::Gpu;
 
 const SUPERSAMPLE: u32 = 4;
 const SAMPLES: u32 = 4;
@@ -63,15 +67,14 @@ pub enum RasterError {
         found: u64,
     },
     /// The device refused the work or was lost.
-    #[error("the graphics device failed: {0}")]
-    Device(String),
+    #[error(transparent)]
+    Device(#[from] ExecutorError),
 }
 
 /// Pipelines and targets. Pictures come out the same, bit for bit, each time on one device.
 #[derive(Debug)]
 pub struct Rasterizer {
-    device: wgpu::Device,
-    queue: wgpu::Queue,
+    gpu: Gpu,
     pipeline: wgpu::RenderPipeline,
     camera: wgpu::Buffer,
     camera_group: wgpu::BindGroup,
@@ -95,8 +98,13 @@ struct CameraUniform {
 }
 
 impl Rasterizer {
-    /// Builds the pipeline on a device of any features and limits.
-    pub fn new(device: &wgpu::Device, queue: &wgpu::Queue) -> Self {
+    /// Builds the pipeline; it needs no features and no more than the default limits.
+    pub fn new(gpu: &Gpu) -> Result<Self, RasterError> {
+        Ok(gpu.checked("raster/pipeline", || Self::build(gpu))?)
+    }
+
+    fn build(gpu: &Gpu) -> Self {
+        let device = gpu.device();
         let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some("raster"),
             source: wgpu::ShaderSource::Wgsl(include_str!("raster.wgsl").into()),
@@ -153,53 +161,55 @@ impl Rasterizer {
             mipmap_filter: wgpu::MipmapFilterMode::Linear,
             ..Default::default()
         });
-        Self { device: device.clone(), queue: queue.clone(), pipeline, camera, camera_group, sampler }
+        Self { gpu: gpu.clone(), pipeline, camera, camera_group, sampler }
     }
 
     /// Copies a mesh to the device.
     pub fn upload(&self, vertices: &[Vertex], parts: &[Part], textures: &[Texture]) -> Result<Model, RasterError> {
         let bytes = bytemuck::cast_slice::<_, u8>(vertices);
-        check("bytes of vertices, at most", self.device.limits().max_buffer_size, bytes.len() as u64, |most, n| n <= most)?;
+        check("bytes of vertices, at most", self.gpu.device().limits().max_buffer_size, bytes.len() as u64, |most, n| n <= most)?;
         for (range, texture) in parts {
             let end = u64::from(range.end.max(range.start));
             check("vertices that a part refers to, at most", vertices.len() as u64, end, |most, n| n <= most)?;
             let index = texture.map_or(0, |t| t as u64 + 1);
             check("textures that a part refers to, at most", textures.len() as u64, index, |most, n| n <= most)?;
         }
-        let largest = u64::from(self.device.limits().max_texture_dimension_2d);
+        let largest = u64::from(self.gpu.device().limits().max_texture_dimension_2d);
         for texture in textures {
             let [width, height] = [texture.width, texture.height].map(u64::from);
             check("texture side in pixels, at least", 1, width.min(height), |least, n| n >= least)?;
             check("texture side in pixels, at most", largest, width.max(height), |most, n| n <= most)?;
             check("bytes of a texture", 4 * width * height, texture.rgba.len() as u64, |a, b| a == b)?;
         }
-        self.checked(|| {
-            let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
+        Ok(self.gpu.checked("raster/upload", || {
+            let buffer = self.gpu.device().create_buffer(&wgpu::BufferDescriptor {
                 label: Some("raster vertices"),
                 size: bytes.len().max(4) as u64,
                 usage: wgpu::BufferUsages::VERTEX | wgpu::BufferUsages::COPY_DST,
                 mapped_at_creation: false,
             });
-            self.queue.write_buffer(&buffer, 0, bytes);
+            self.gpu.queue().write_buffer(&buffer, 0, bytes);
             let white = Texture { width: 1, height: 1, rgba: &[255; 4] };
             let textures: Vec<_> = textures.iter().chain([&white]).map(|texture| self.texture(texture)).collect();
             let untextured = textures.len() - 1;
             let parts = parts.iter().map(|(range, texture)| (range.clone(), texture.unwrap_or(untextured))).collect();
             Model { vertices: buffer, parts, textures }
-        })
+        })?)
     }
 
     /// Draws the model on white. Returns RGB bytes, row-major `[side, side, 3]`.
     pub fn render(&self, model: &Model, view: &View) -> Result<Vec<u8>, RasterError> {
-        let largest = u64::from(self.device.limits().max_texture_dimension_2d / SUPERSAMPLE);
+        let largest = u64::from(self.gpu.device().limits().max_texture_dimension_2d / SUPERSAMPLE);
         check("picture side in pixels, at least", 1, view.side.into(), |least, n| n >= least)?;
         check("picture side in pixels, at most", largest, view.side.into(), |most, n| n <= most)?;
         let side = view.side * SUPERSAMPLE;
         let row_bytes = (4 * side).next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT);
+        let bytes = u64::from(row_bytes) * u64::from(side);
+        check("bytes of a picture's samples, at most", self.gpu.device().limits().max_buffer_size, bytes, |most, n| n <= most)?;
         let size = wgpu::Extent3d { width: side, height: side, depth_or_array_layers: 1 };
-        let staging = self.checked(|| {
+        let copy = self.gpu.checked("raster/render", || {
             let target = |label, format, sample_count, usage| {
-                self.device.create_texture(&wgpu::TextureDescriptor {
+                self.gpu.device().create_texture(&wgpu::TextureDescriptor {
                     label: Some(label),
                     size,
                     mip_level_count: 1,
@@ -214,14 +224,14 @@ impl Rasterizer {
             let samples = target("raster samples", COLOUR, SAMPLES, attachment).create_view(&Default::default());
             let depth = target("raster depth", DEPTH, SAMPLES, attachment).create_view(&Default::default());
             let picture = target("raster picture", COLOUR, 1, attachment | wgpu::TextureUsages::COPY_SRC);
-            let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("raster read-back"),
-                size: u64::from(row_bytes) * u64::from(side),
-                usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ,
+            let copy = self.gpu.device().create_buffer(&wgpu::BufferDescriptor {
+                label: Some("raster copy"),
+                size: bytes,
+                usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC,
                 mapped_at_creation: false,
             });
-            self.queue.write_buffer(&self.camera, 0, bytemuck::bytes_of(&camera_uniform(view)));
-            let mut encoder = self.device.create_command_encoder(&Default::default());
+            self.gpu.queue().write_buffer(&self.camera, 0, bytemuck::bytes_of(&camera_uniform(view)));
+            let mut encoder = self.gpu.device().create_command_encoder(&Default::default());
             let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
                 label: Some("raster"),
                 color_attachments: &[Some(wgpu::RenderPassColorAttachment {
@@ -248,40 +258,23 @@ impl Rasterizer {
             encoder.copy_texture_to_buffer(
                 picture.as_image_copy(),
                 wgpu::TexelCopyBufferInfo {
-                    buffer: &staging,
+                    buffer: &copy,
                     layout: wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(row_bytes), rows_per_image: None },
                 },
                 size,
             );
-            self.queue.submit([encoder.finish()]);
-            staging
+            self.gpu.queue().submit([encoder.finish()]);
+            copy
         })?;
-        let (sender, receiver) = std::sync::mpsc::channel();
-        staging.map_async(wgpu::MapMode::Read, .., move |result| _ = sender.send(result));
-        let device_error = |error: &dyn std::fmt::Display| RasterError::Device(error.to_string());
-        self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|e| device_error(&e))?;
-        receiver.recv().map_err(|e| device_error(&e))?.map_err(|e| device_error(&e))?;
-        let bytes = staging.get_mapped_range(..).map_err(|e| device_error(&e))?;
-        Ok(box_filter(&bytes, row_bytes as usize, view.side as usize))
-    }
-
-    /// Runs work on the device and returns what the device says about it.
-    fn checked<T>(&self, work: impl FnOnce() -> T) -> Result<T, RasterError> {
-        let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
-        let validation = self.device.push_error_scope(wgpu::ErrorFilter::Validation);
-        let done = work();
-        let errors = [pollster::block_on(validation.pop()), pollster::block_on(memory.pop())];
-        match errors.into_iter().flatten().next() {
-            Some(error) => Err(RasterError::Device(error.to_string())),
-            None => Ok(done),
-        }
+        let samples = self.gpu.download("raster/render", &copy, bytes)?;
+        Ok(box_filter(&samples, row_bytes as usize, view.side as usize))
     }
 
     /// Uploads a texture with all its halved sizes, so that it stays smooth from afar.
     fn texture(&self, picture: &Texture) -> wgpu::BindGroup {
         let [mut width, mut height] = [picture.width, picture.height];
         let mip_level_count = width.max(height).ilog2() + 1;
-        let texture = self.device.create_texture(&wgpu::TextureDescriptor {
+        let texture = self.gpu.device().create_texture(&wgpu::TextureDescriptor {
             label: Some("raster albedo"),
             size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
             mip_level_count,
@@ -293,7 +286,7 @@ impl Rasterizer {
         });
         let mut level = picture.rgba.to_vec();
         for mip_level in 0..mip_level_count {
-            self.queue.write_texture(
+            self.gpu.queue().write_texture(
                 wgpu::TexelCopyTextureInfo { mip_level, ..texture.as_image_copy() },
                 &level,
                 wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(4 * width), rows_per_image: None },
@@ -302,7 +295,7 @@ impl Rasterizer {
             level = halve(&level, width as usize, height as usize);
             [width, height] = [width, height].map(|n| (n / 2).max(1));
         }
-        self.device.create_bind_group(&wgpu::BindGroupDescriptor {
+        self.gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some("raster albedo"),
             layout: &self.pipeline.get_bind_group_layout(1),
             entries: &[

@@ -64,7 +64,7 @@ struct Render {
     /// Replace instances that exist in the output folder.
     #[arg(long)]
     force: bool,
-    /// Name, or part of it, of the graphics adapter. Default: the first that is not a software one, else the first.
+    /// Name, or part of it, of the graphics adapter. Default: the fastest kind.
     #[arg(long)]
     adapter: Option<String>,
 }
@@ -141,8 +141,9 @@ fn render(args: &Render) -> Result<()> {
             return Err(format!("{}: two meshes have the same name", path.display()).into());
         }
     }
-    let (device, queue) = pollster::block_on(open_device(args.adapter.as_deref()))?;
-    let rasterizer = Rasterizer::new(&device, &queue);
+    let gpu = srn_gpu::Gpu::open(args.adapter.as_deref())?;
+    eprintln!("adapter: {}", gpu.adapter());
+    let rasterizer = Rasterizer::new(&gpu)?;
     let progress = indicatif::ProgressBar::new((args.meshes.len() * args.views) as u64)
         .with_style(indicatif::ProgressStyle::with_template("{bar:30} {pos}/{len} {msg} {eta}")?);
     for (name, path) in &args.meshes {
@@ -212,20 +213,6 @@ fn upload(rasterizer: &Rasterizer, mesh: &Mesh) -> Result<raster::Model> {
     let textures = mesh.textures.iter().map(|t| raster::Texture { width: t.width(), height: t.height(), rgba: t.as_raw() });
     let textures: Vec<_> = textures.collect();
     Ok(rasterizer.upload(&vertices, &parts, &textures)?)
-}
-
-async fn open_device(name: Option<&str>) -> Result<(wgpu::Device, wgpu::Queue)> {
-    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
-    let mut adapters = instance.enumerate_adapters(wgpu::Backends::PRIMARY).await;
-    adapters.sort_by_key(|adapter| adapter.get_info().device_type == wgpu::DeviceType::Cpu);
-    let fits = |adapter: &wgpu::Adapter| name.is_none_or(|n| adapter.get_info().name.to_lowercase().contains(&n.to_lowercase()));
-    let known: Vec<_> = adapters.iter().map(|adapter| adapter.get_info().name).collect();
-    let adapter = adapters.into_iter().find(fits).ok_or_else(|| match name {
-        Some(name) => format!("no graphics adapter called \"{name}\" among {known:?}"),
-        None => "no graphics adapter; a software one is in the package mesa-vulkan-drivers".into(),
-    })?;
-    eprintln!("adapter: {}", adapter.get_info().name);
-    Ok(adapter.request_device(&Default::default()).await?)
 }
 
 fn inspect(args: &Inspect) -> Result<bool> {
