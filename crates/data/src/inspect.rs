@@ -155,3 +155,80 @@ pub fn contact_sheet(set: &SrnSet, report: &Report, columns: usize, rows: usize)
     image::imageops::replace(&mut whole, &drawing, 0, views.height().into());
     whole
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{look_at_origin, uniform_sphere};
+    use crate::srn::InstanceWriter;
+    use glam::DVec3;
+    use std::path::Path;
+
+    const INTRINSICS: Intrinsics = Intrinsics { focal: 10.0, centre: [4.0, 4.0], size: [8, 8] };
+
+    fn set(names: &[&str]) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        for name in names {
+            let writer = InstanceWriter::create(dir.path().join(name), &INTRINSICS, false).unwrap();
+            for (i, pose) in uniform_sphere(4, 1.3, 1).iter().enumerate() {
+                writer.add(&format!("{i}"), &sheet::blank(8, 8), pose).unwrap();
+            }
+        }
+        dir
+    }
+
+    fn inspected(dir: &Path) -> (SrnSet, Report) {
+        let set = SrnSet::open(dir).unwrap();
+        let report = inspect(&set).unwrap();
+        (set, report)
+    }
+
+    #[test]
+    fn a_good_set_has_no_problems() {
+        let dir = set(&["a", "b"]);
+        let (set, report) = inspected(dir.path());
+        assert!(report.problems.is_empty(), "{:?}", report.problems);
+        assert_eq!(report.instances.iter().map(|i| (i.name.as_str(), i.views)).collect::<Vec<_>>(), [("a", 4), ("b", 4)]);
+        assert_eq!(report.instances[0].sizes, BTreeMap::from([("8×8".into(), 4)]));
+        assert!(report.instances[0].radius.unwrap().iter().all(|r| (r - 1.3).abs() < 1e-6));
+        let json = serde_json::to_string(&report).unwrap();
+        assert!(json.contains("\"views\":4") && json.contains("\"problems\":[]"), "{json}");
+        let sheet = contact_sheet(&set, &report, 3, 9);
+        assert!(sheet.pixels().any(|p| p.0 == [40, 60, 230]), "no camera is drawn");
+    }
+
+    #[test]
+    fn every_problem_is_found_and_named() {
+        let remove = |path: &Path| std::fs::remove_file(path).unwrap();
+        let text = |text: &'static str| move |path: &Path| std::fs::write(path, text).unwrap();
+        let pose = |pose: DMat4| {
+            let rows: Vec<_> = pose.transpose().to_cols_array().iter().map(f64::to_string).collect();
+            move |path: &Path| std::fs::write(path, rows.join(" ")).unwrap()
+        };
+        let picture = |path: &Path| sheet::blank(9, 8).save(path).unwrap();
+        let good = look_at_origin(1.3 * DVec3::X);
+        let scaled = |x| DMat4::from_scale(DVec3::new(x, 1.0, 1.0));
+        type Spoil = Box<dyn Fn(&Path)>;
+        let cases: [(&str, Spoil, &str); 11] = [
+            ("pose/2.txt", Box::new(remove), "picture without a pose"),
+            ("rgb/2.png", Box::new(remove), "pose without a picture"),
+            ("rgb/2.png", Box::new(text("not a picture")), "not a readable image"),
+            ("rgb/2.png", Box::new(picture), "9×8, but intrinsics.txt is for 8×8"),
+            ("pose/2.txt", Box::new(text("1 2 3")), "16 numbers"),
+            ("pose/2.txt", Box::new(pose(good * scaled(1.01))), "not rigid"),
+            ("pose/2.txt", Box::new(pose(good * scaled(-1.0))), "left-handed"),
+            ("pose/2.txt", Box::new(pose(good * DMat4::from_rotation_x(0.1))), "5.7° past the origin"),
+            ("pose/2.txt", Box::new(pose(look_at_origin(1.4 * DVec3::X))), "from 1.300 to 1.400"),
+            ("intrinsics.txt", Box::new(remove), "No such file"),
+            ("intrinsics.txt", Box::new(text("10 4.5 4\n0 0 0\n1\n8 8\n")), "differ from those of a"),
+        ];
+        for (file, spoil, expected) in cases {
+            let dir = set(&["a", "b"]);
+            spoil(&dir.path().join("b").join(file));
+            let (set, report) = inspected(dir.path());
+            let [problem] = &report.problems[..] else { panic!("{expected}: {:?}", report.problems) };
+            assert!(problem.contains(expected) && problem.contains("/b"), "{expected}: {problem}");
+            contact_sheet(&set, &report, 2, 2);
+        }
+    }
+}

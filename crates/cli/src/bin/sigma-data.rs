@@ -38,14 +38,14 @@ struct Render {
     #[arg(long)]
     out: PathBuf,
     /// Width and height of the pictures in pixels.
-    #[arg(long, default_value_t = 64)]
-    side: usize,
+    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
+    side: u32,
     /// Distance of the cameras to the object's centre; the diagonal of its bounding box is 1.
-    #[arg(long, default_value_t = 1.3)]
+    #[arg(long, default_value_t = 1.3, value_parser = |x: &str| between(x, 0.5, f64::MAX))]
     radius: f64,
     /// Views per object.
-    #[arg(long, default_value_t = 50)]
-    views: usize,
+    #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..))]
+    views: u32,
     /// Where the cameras stand.
     #[arg(long, value_enum, default_value_t = Cameras::Sphere)]
     cameras: Cameras,
@@ -53,10 +53,10 @@ struct Render {
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Focal length in pixels. Default: the object's bounding sphere just fits into the picture.
-    #[arg(long, conflicts_with = "fov")]
+    #[arg(long, conflicts_with = "fov", value_parser = |x: &str| between(x, 0.0, f64::MAX))]
     focal: Option<f64>,
     /// Angle of view in degrees, instead of --focal.
-    #[arg(long)]
+    #[arg(long, value_parser = |x: &str| between(x, 0.0, 180.0))]
     fov: Option<f64>,
     /// Which axis points up in .obj files (LDraw has its own).
     #[arg(long, value_enum, default_value_t = ObjUp::Y)]
@@ -114,22 +114,15 @@ fn main() -> ExitCode {
 }
 
 fn render(args: &Render) -> Result<()> {
+    let (side, views) = (args.side as usize, args.views as usize);
     let focal = match (args.focal, args.fov) {
         (Some(focal), _) => focal,
-        (_, Some(fov)) => 0.5 * args.side as f64 / (0.5 * fov.to_radians()).tan(),
-        _ => camera::fitting_focal_px(args.side, args.radius),
+        (_, Some(fov)) => 0.5 * side as f64 / (0.5 * fov.to_radians()).tan(),
+        _ => camera::fitting_focal_px(side, args.radius),
     };
-    let positive = |x: f64| x.is_finite() && x > 0.0;
-    for (name, value) in
-        [("--focal", focal), ("--radius", args.radius - 0.5), ("--views", args.views as f64), ("--side", args.side as f64)]
-    {
-        if !positive(value) {
-            return Err(format!("{name}: out of range (the object has radius 0.5, and the camera must stand outside)").into());
-        }
-    }
     // The SRN convention puts the principal point at side / 2 while integer coordinates are pixel centres.
-    let half = args.side as f64 / 2.0;
-    let intrinsics = Intrinsics { focal, centre: [half, half], size: [args.side, args.side] };
+    let half = side as f64 / 2.0;
+    let intrinsics = Intrinsics { focal, centre: [half, half], size: [side, side] };
 
     let mut names = std::collections::BTreeSet::new();
     for (name, path) in &args.meshes {
@@ -141,32 +134,33 @@ fn render(args: &Render) -> Result<()> {
             return Err(format!("{}: two meshes have the same name", path.display()).into());
         }
     }
+    // All are read before anything is written.
+    let meshes = args.meshes.iter().map(|(_, path)| load_mesh(path, args.up)).collect::<Result<Vec<_>>>()?;
     let gpu = srn_gpu::Gpu::open(args.adapter.as_deref())?;
     eprintln!("adapter: {}", gpu.adapter());
     let rasterizer = Rasterizer::new(&gpu)?;
-    let progress = indicatif::ProgressBar::new((args.meshes.len() * args.views) as u64)
+    let progress = indicatif::ProgressBar::new((args.meshes.len() * views) as u64)
         .with_style(indicatif::ProgressStyle::with_template("{bar:30} {pos}/{len} {msg} {eta}")?);
-    for (name, path) in &args.meshes {
-        let mut mesh = load_mesh(path, args.up)?;
-        for warning in std::mem::take(&mut mesh.warnings) {
+    for ((name, path), mesh) in args.meshes.iter().zip(&meshes) {
+        for warning in &mesh.warnings {
             progress.suspend(|| eprintln!("warning: {}: {warning}", path.display()));
         }
         progress.set_message(name.clone());
-        let model = upload(&rasterizer, &mesh)?;
+        let model = upload(&rasterizer, mesh)?;
         let writer = InstanceWriter::create(args.out.join(name), &intrinsics, args.force)?;
         let poses = match args.cameras {
             // Each object is seen from other places.
-            Cameras::Sphere => camera::uniform_sphere(args.views, args.radius, args.seed ^ ldraw::name_hash(name)),
-            Cameras::Spiral => camera::spiral(args.views, args.radius),
+            Cameras::Sphere => camera::uniform_sphere(views, args.radius, args.seed ^ ldraw::name_hash(name)),
+            Cameras::Spiral => camera::spiral(views, args.radius),
         };
         for (i, pose) in poses.iter().enumerate() {
             let view = raster::View {
                 world_from_camera: pose.transpose().to_cols_array(),
                 intrinsics: [focal, focal, half, half],
-                side: args.side as u32,
+                side: args.side,
             };
-            let side = view.side;
-            let rgb = RgbImage::from_raw(side, side, rasterizer.render(&model, &view)?).ok_or("picture of the wrong size")?;
+            let rgb =
+                RgbImage::from_raw(args.side, args.side, rasterizer.render(&model, &view)?).ok_or("picture of the wrong size")?;
             writer.add(&format!("{i:06}"), &rgb, pose)?;
             progress.inc(1);
         }
@@ -174,6 +168,14 @@ fn render(args: &Render) -> Result<()> {
     progress.finish_and_clear();
     println!("{} instances of {} views in {}, {focal:.3} px focal length", args.meshes.len(), args.views, args.out.display());
     Ok(())
+}
+
+fn between(text: &str, low: f64, high: f64) -> std::result::Result<f64, String> {
+    match text.parse() {
+        Ok(x) if low < x && x < high => Ok(x),
+        _ if high == f64::MAX => Err(format!("expected a number above {low}")),
+        _ => Err(format!("expected a number between {low} and {high}")),
+    }
 }
 
 fn named_mesh(argument: &str) -> std::result::Result<(String, PathBuf), String> {
