@@ -1,7 +1,7 @@
 //! Wavefront OBJ with MTL materials and textures.
 
 use crate::error::{At, Error, Result};
-use crate::mesh::{Mesh, Part, Vertex};
+use crate::mesh::{Mesh, Part};
 use glam::{Vec2, Vec3};
 use std::path::Path;
 
@@ -11,10 +11,10 @@ use std::path::Path;
 pub fn load(path: &Path) -> Result<Mesh> {
     let text = String::from_utf8_lossy(&std::fs::read(path).at(path)?).into_owned();
     let mut mesh = Mesh::default();
-    let text = without_bad_faces(&text, &mut mesh.warnings);
+    let text = tidy(&text, &mut mesh.warnings);
     let folder = path.parent().unwrap_or(Path::new(""));
     let material_warnings = std::cell::RefCell::new(vec![]);
-    let options = tobj::LoadOptions { single_index: true, triangulate: true, ignore_points: true, ignore_lines: true };
+    let options = tobj::LoadOptions { single_index: false, triangulate: true, ignore_points: true, ignore_lines: true };
     let (models, materials) = tobj::load_obj_buf(&mut text.as_bytes(), &options, |name| {
         let loaded = std::fs::read(folder.join(name)).map_err(|e| e.to_string());
         let loaded = loaded.and_then(|bytes| tobj::load_mtl_buf(&mut bytes.as_slice()).map_err(|e| e.to_string()));
@@ -46,17 +46,19 @@ pub fn load(path: &Path) -> Result<Mesh> {
         });
         let plain = material.and_then(|m| m.diffuse).map_or(Vec3::splat(0.6), |[r, g, b]| Vec3::new(r, g, b));
         let colour = if texture.is_some() { Vec3::ONE } else { plain };
-        let at = |values: &[f32], i: u32| values.get(3 * i as usize..).and_then(|v| v.get(..3)).map(Vec3::from_slice);
+        let at3 = |v: &[f32], i: u32| v.get(3 * i as usize..).and_then(|v| v.get(..3)).map(Vec3::from_slice).unwrap_or_default();
+        let at2 = |v: &[f32], i: u32| v.get(2 * i as usize..).and_then(|v| v.get(..2)).map(Vec2::from_slice).unwrap_or_default();
         let start = mesh.vertices.len();
-        for triangle in shape.indices.chunks_exact(3) {
+        let corners = |values: &[u32], at: usize| values.get(at..at + 3).and_then(|v| v.try_into().ok()).unwrap_or([u32::MAX; 3]);
+        for first in (0..shape.indices.len()).step_by(3) {
             let before = mesh.vertices.len();
-            mesh.push_flat([0, 1, 2].map(|k| at(&shape.positions, triangle[k]).unwrap_or_default()), colour);
-            for (vertex, &i) in mesh.vertices[before..].iter_mut().zip(triangle) {
-                let normal = at(&shape.normals, i).unwrap_or_default().normalize_or_zero();
-                let uv = shape.texcoords.get(2 * i as usize..).and_then(|v| v.get(..2)).map(Vec2::from_slice);
-                // OBJ has v upwards.
-                let uv = uv.map_or(Vec2::ZERO, |uv| Vec2::new(uv.x, 1.0 - uv.y));
-                *vertex = Vertex { normal: if normal == Vec3::ZERO { vertex.normal } else { normal }, uv, ..*vertex };
+            let positions = corners(&shape.indices, first).map(|i| at3(&shape.positions, i));
+            mesh.push_flat(positions, colour);
+            let normals = corners(&shape.normal_indices, first).map(|i| at3(&shape.normals, i).normalize_or_zero());
+            let uvs = corners(&shape.texcoord_indices, first).map(|i| at2(&shape.texcoords, i));
+            for ((vertex, normal), uv) in mesh.vertices[before..].iter_mut().zip(normals).zip(uvs) {
+                vertex.normal = if normal == Vec3::ZERO { vertex.normal } else { normal };
+                vertex.uv = Vec2::new(uv.x, 1.0 - uv.y); // OBJ has v upwards
             }
         }
         mesh.parts.push(Part { vertices: start..mesh.vertices.len(), texture });
@@ -67,35 +69,35 @@ pub fn load(path: &Path) -> Result<Mesh> {
     Ok(mesh)
 }
 
-/// The text with every face taken out that refers to what the file does not have; tobj would refuse the whole file.
-fn without_bad_faces(text: &str, warnings: &mut Vec<String>) -> String {
-    let mut counts = [0i64; 3]; // v, vt, vn up to here: negative indices count back from them
-    let mut out = String::with_capacity(text.len());
-    let count_all = |key: &str| text.lines().filter(|line| line.split_whitespace().next() == Some(key)).count() as i64;
-    let totals = ["v", "vt", "vn"].map(count_all);
+/// The text with all vertices first, all indices absolute, and every face left out that refers to what the file does not have:
+/// tobj refuses a whole file for one bad index, and for a face that stands before its vertices.
+fn tidy(text: &str, warnings: &mut Vec<String>) -> String {
+    let key = |line: &str| ["v", "vt", "vn"].iter().position(|&key| line.split_whitespace().next() == Some(key));
+    let mut totals = [0i64; 3];
+    text.lines().filter_map(key).for_each(|k| totals[k] += 1);
+    let mut counts = [0i64; 3]; // up to here: negative indices count back from them
+    let [mut vertices, mut rest] = [String::with_capacity(text.len()), String::new()];
     for (number, line) in text.lines().enumerate() {
-        let mut words = line.split_whitespace();
-        let good = match words.next() {
-            Some("v") => (counts[0] += 1, true).1,
-            Some("vt") => (counts[1] += 1, true).1,
-            Some("vn") => (counts[2] += 1, true).1,
-            Some("f") => words.take_while(|word| !word.starts_with('#')).all(|corner| {
-                corner.split('/').enumerate().all(|(k, index)| match index.parse::<i64>() {
-                    Ok(i) if i > 0 => k < 3 && i <= totals[k],
-                    Ok(i) if i < 0 => k < 3 && -i <= counts[k],
-                    _ => index.is_empty() && k > 0,
-                })
-            }),
-            _ => true,
-        };
-        if good {
-            out.push_str(line);
+        let mut words = line.split_whitespace().take_while(|word| !word.starts_with('#'));
+        if let Some(k) = key(line) {
+            counts[k] += 1;
+            vertices.extend([line, "\n"]);
+        } else if words.next() == Some("f") {
+            let index = |(k, index): (usize, &str)| match index.parse::<i64>() {
+                Ok(i) if k < 3 && i > 0 && i <= totals[k] => Some(i.to_string()),
+                Ok(i) if k < 3 && i < 0 && -i <= counts[k] => Some((counts[k] + 1 + i).to_string()),
+                _ => (index.is_empty() && k > 0).then(String::new),
+            };
+            let corner = |corner: &str| Some(corner.split('/').enumerate().map(index).collect::<Option<Vec<_>>>()?.join("/"));
+            match words.map(corner).collect::<Option<Vec<_>>>() {
+                Some(face) => rest.extend(["f ", &face.join(" "), "\n"]),
+                None => warnings.push(format!("line {}: face left out, index out of range: {}", number + 1, line.trim())),
+            }
         } else {
-            warnings.push(format!("line {}: face left out, index out of range: {}", number + 1, line.trim()));
+            rest.extend([line, "\n"]);
         }
-        out.push('\n');
     }
-    out
+    vertices + &rest
 }
 
 #[cfg(test)]
@@ -128,6 +130,13 @@ mod tests {
     }
 
     #[test]
+    fn corners_without_texture_coordinates_leave_the_others_alone() {
+        let mesh = loaded(&OBJ.replace("usemtl wood\n", "usemtl wood\nf 1 2 3\n")).unwrap();
+        let textured = &mesh.vertices[9..];
+        assert!(textured.iter().all(|v| v.uv == Vec2::new(v.position.x, 1.0 - v.position.y)), "{textured:?}");
+    }
+
+    #[test]
     fn faces_with_bad_indices_are_left_out() {
         for bad in ["f 1 2 5", "f 1 2 0", "f -5 -1 -2", "f 1/9 2/1 3/1", "f 1//1 2//1 3//1", "f 1 2 x"] {
             let mesh = loaded(&format!("{OBJ}{bad}\n")).unwrap();
@@ -136,6 +145,8 @@ mod tests {
         }
         let mesh = loaded(&format!("{OBJ}f -4 -3 -2\n")).unwrap();
         assert_eq!((mesh.vertices.len(), mesh.warnings.len()), (15, 0), "a face that counts back from the end is good");
+        let mesh = loaded("f 1 2 3\nusemtl red\nf 1 2 3\nv 0 0 0\nv 1 0 0\nv 1 1 0\n").unwrap();
+        assert_eq!((mesh.vertices.len(), mesh.warnings.len()), (6, 0), "vertices may come last");
         let error = loaded("v 0 0 0\nf 1 2 3\n").unwrap_err().to_string();
         assert!(error.contains("mesh.obj") && error.contains("faces"), "{error}");
     }
