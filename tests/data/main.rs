@@ -91,9 +91,12 @@ fn points_appear_where_the_camera_projects_them() {
         let picture = rasterizer.render(&blobs, &view(&pose)).unwrap();
         let camera = Camera { world_from_camera: pose, intrinsics: INTRINSICS, size: [SIDE as usize; 2], pixel_centre: 0.0 };
         for (channel, (point, _)) in points.iter().enumerate() {
-            // White less the other two channels leaves this blob alone, weighed by how much of the pixel it covers.
-            let other = |p: &[u8]| (0..3).filter(|&c| c != channel).map(|c| 255.0 - f64::from(p[c])).sum::<f64>();
-            let own = |p: &[u8]| (other(p) / 2.0 - (255.0 - f64::from(p[channel]))).max(0.0);
+            // The share of a pixel that the blob covers: its colour lacks the other two channels, however it is lit.
+            let dark = |p: &[u8], c: usize| 255.0 - f64::from(p[c]);
+            let own = |p: &[u8]| {
+                let others = dark(p, (channel + 1) % 3).min(dark(p, (channel + 2) % 3));
+                if others > dark(p, channel) { others } else { 0.0 }
+            };
             let [mut sum, mut weight] = [DVec2::ZERO, DVec2::ZERO];
             for (i, p) in picture.chunks(3).enumerate() {
                 sum += own(p) * DVec2::new((i as u32 % SIDE).into(), (i as u32 / SIDE).into());
@@ -103,9 +106,9 @@ fn points_appear_where_the_camera_projects_them() {
             let projected = |k: usize| camera.project(points[k].0.as_dvec3()).0;
             let alone = (0..3).all(|k| k == channel || (projected(k) - projected(channel)).length() > 9.0);
             if alone {
-                // Worst of these views: 0.29 px (lavapipe); lit and dark faces of a blob weigh differently.
+                // Worst of these views: 0.081 px (lavapipe); the middle of a silhouette is not quite the projected middle.
                 let (expected, _) = camera.project(point.as_dvec3());
-                assert!(weight.x > 255.0 && (sum / weight - expected).length() < 0.6, "{channel}: {} {expected}", sum / weight);
+                assert!(weight.x > 255.0 && (sum / weight - expected).length() < 0.2, "{channel}: {} {expected}", sum / weight);
             }
         }
     }
