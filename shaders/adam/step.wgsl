@@ -7,6 +7,8 @@ struct Params {
     count: u32,
     beta1: f32,
     beta2: f32,
+    one_minus_beta1: f32,
+    one_minus_beta2: f32,
     epsilon: f32,
 }
 
@@ -28,8 +30,8 @@ fn main(
         return;
     }
     let g = gradient[i];
-    let first = params.beta1 * m[i] + (1.0 - params.beta1) * g;
-    let second = params.beta2 * v[i] + (1.0 - params.beta2) * g * g;
+    let first = params.beta1 * m[i] + params.one_minus_beta1 * g;
+    let second = params.beta2 * v[i] + params.one_minus_beta2 * g * g;
     m[i] = first;
     v[i] = second;
     value[i] -= schedule[0] * (first * schedule[1]) / (sqrt(second * schedule[2]) + params.epsilon);

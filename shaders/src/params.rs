@@ -205,6 +205,10 @@ params! {
         beta1: f32,
         /// Decay of the second moment.
         beta2: f32,
+        /// `1 - beta1`, rounded once: the difference of the rounded numbers is off by 1e-5 of itself.
+        one_minus_beta1: f32,
+        /// `1 - beta2`.
+        one_minus_beta2: f32,
         /// Added to the denominator.
         epsilon: f32,
     }

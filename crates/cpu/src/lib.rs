@@ -1,1 +1,13 @@
-//! placeholder
+//! This crate owns the reference of every op, in `f32` and `f64`, and the executor that runs a plan on the CPU.
+//! It does not know the model, the GPU or files.
+//!
+//! In `f64` it is the oracle that the WGSL kernels are tested against; in `f32`, threaded, it is the fallback for a machine
+//! without a GPU. The functions in [`ops`] take the parameter struct of the kernel and plain slices, inputs before outputs.
+
+mod executor;
+pub mod ops;
+mod real;
+mod simd;
+
+pub use executor::CpuExecutor;
+pub use real::Real;

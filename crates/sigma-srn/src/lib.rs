@@ -1,1 +1,31 @@
-//! placeholder
+//! This crate owns the σSRN model: its weights, the renderer, training and pose estimation, written once as plans for the
+//! executors. It does not know files other than models, nor command lines.
+//!
+//! The equations of the paper (arXiv 2305.17252) stand in its order in `network/forward.rs`: hypernetwork, rays, scene MLP f,
+//! LSTM ray marcher, density net g, density-weighted sum, pixel generator h; `network/backward.rs` mirrors it.
+//! Conventions: OpenCV camera axes (x right, y down, z forward), `world_from_camera`, world z up, lengths in object units
+//! (the object's bounding-box diagonal is 1), colours in [-1, 1].
+
+pub mod camera;
+mod descent;
+mod engine;
+mod error;
+mod estimator;
+mod model;
+mod network;
+mod random;
+mod rays;
+mod renderer;
+mod trainer;
+
+pub use camera::{Intrinsics, Pose6};
+pub use descent::{Descent, Loss, Shape};
+pub use engine::Engine;
+pub use error::Error;
+pub use estimator::{Estimate, Options, Phase, Progress, Query, Ranked, estimate};
+pub use model::{Block, Kind, Layout, Metadata, Model, ModelConfig, Parameter, write_atomically};
+pub use random::{Random, stream};
+pub use rays::{Rays, pixel_grid};
+pub use renderer::{Renderer, Rendering};
+pub use srn_gpu::{AdapterInfo, Gpu, adapters};
+pub use trainer::{Losses, Train, Trainer, TrainingBatch};

@@ -1,0 +1,131 @@
+//! Linear layers through a matrix library, rows in blocks that fit the cache, blocks in parallel.
+
+use gemm::{Parallelism, gemm};
+use rayon::prelude::*;
+use srn_shaders::LinearParams;
+
+use super::chunk_of;
+use crate::Real;
+
+/// Rows of a block that one thread multiplies.
+const BLOCK_ROWS: usize = 256;
+
+/// A matrix as the library wants it: values and the distances between rows and between columns.
+struct Matrix<'a, T>(&'a [T], [usize; 2]);
+
+/// `c [m,n] = (c if accumulate) + a [m,k] · b [k,n]`, `c` row-major.
+fn product<T: Real>([m, n, k]: [usize; 3], c: &mut [T], a: Matrix<T>, b: Matrix<T>, accumulate: bool, threads: Parallelism) {
+    let last = |[row, column]: [usize; 2], rows: usize, columns: usize| (rows - 1) * row + (columns - 1) * column;
+    assert!(c.len() >= m * n && a.0.len() > last(a.1, m, k) && b.0.len() > last(b.1, k, n), "matrix product out of range");
+    let [a_row, a_column] = a.1.map(|stride| stride as isize);
+    let [b_row, b_column] = b.1.map(|stride| stride as isize);
+    // SAFETY: the three ranges were checked above, and `c` is borrowed mutably.
+    unsafe {
+        gemm(
+            m,
+            n,
+            k,
+            c.as_mut_ptr(),
+            1,
+            n as isize,
+            accumulate,
+            a.0.as_ptr(),
+            a_column,
+            a_row,
+            b.0.as_ptr(),
+            b_column,
+            b_row,
+            T::one(),
+            T::one(),
+            false,
+            false,
+            false,
+            threads,
+        );
+    }
+}
+
+/// The weights of group `group`.
+fn weights_of<'a, T>(p: LinearParams, weights: &'a [T], slots: &[u32], group: usize) -> &'a [T] {
+    let start = if p.weight_stride == 0 { 0 } else { slots[p.first_group as usize + group] as usize * p.weight_stride as usize };
+    &weights[start..start + (p.out_features * p.in_features + p.out_features) as usize]
+}
+
+/// Calls `work(group, first row, block, threads)` for the blocks of all groups: blocks in parallel where there are several,
+/// else one block whose product the library may split.
+fn for_blocks<T: Send>(
+    p: LinearParams,
+    out: &mut [T],
+    width: usize,
+    work: impl Fn(usize, usize, &mut [T], Parallelism) + Sync,
+) {
+    let rows = p.rows_per_group as usize;
+    let out = &mut out[..p.groups as usize * rows * width];
+    if p.groups == 1 && rows <= BLOCK_ROWS {
+        return work(0, 0, out, Parallelism::Rayon(0));
+    }
+    out.par_chunks_mut(rows * width).enumerate().for_each(|(group, out)| {
+        out.par_chunks_mut(BLOCK_ROWS * width).enumerate().for_each(|(block, out)| {
+            work(group, group * rows + block * BLOCK_ROWS, out, Parallelism::None);
+        });
+    });
+}
+
+/// `y (+)= x Wᵀ + b`.
+pub fn forward<T: Real>(p: LinearParams, x: &[T], weights: &[T], slots: &[u32], y: &mut [T]) {
+    let [ins, outs] = [p.in_features as usize, p.out_features as usize];
+    for_blocks(p, y, outs, |group, first_row, y, threads| {
+        let (weight, bias) = weights_of(p, weights, slots, group).split_at(outs * ins);
+        for y in y.chunks_exact_mut(outs) {
+            if p.accumulate == 1 {
+                y.iter_mut().zip(bias).for_each(|(y, &b)| *y += b);
+            } else {
+                y.copy_from_slice(bias);
+            }
+        }
+        let rows = y.len() / outs;
+        let x = Matrix(&x[first_row * ins..(first_row + rows) * ins], [ins, 1]);
+        product([rows, outs, ins], y, x, Matrix(weight, [1, ins]), true, threads);
+    });
+}
+
+/// `d_x (+)= d_y W`, over the outputs `first_out..end_out`.
+pub fn backward_input<T: Real>(p: LinearParams, d_y: &[T], weights: &[T], slots: &[u32], d_x: &mut [T]) {
+    let [ins, outs] = [p.in_features as usize, p.out_features as usize];
+    let [first, end] = [p.first_out as usize, p.end_out as usize];
+    for_blocks(p, d_x, ins, |group, first_row, d_x, threads| {
+        let weight = &weights_of(p, weights, slots, group)[first * ins..end * ins];
+        let rows = d_x.len() / ins;
+        let d_y = Matrix(&d_y[first_row * outs + first..(first_row + rows) * outs], [outs, 1]);
+        product([rows, ins, end - first], d_x, d_y, Matrix(weight, [ins, 1]), p.accumulate == 1, threads);
+    });
+}
+
+/// Per group and chunk of rows: `d_yᵀ x`, then the column sums of `d_y`.
+pub fn backward_weight<T: Real>(p: LinearParams, x: &[T], d_y: &[T], partial: &mut [T]) {
+    let [ins, outs] = [p.in_features as usize, p.out_features as usize];
+    let parameters = outs * ins + outs;
+    let parts = (p.groups * p.chunks) as usize;
+    let work = |part: usize, out: &mut [T], threads: Parallelism| {
+        let (group, chunk) = (part / p.chunks as usize, part % p.chunks as usize);
+        let rows = chunk_of(chunk, p.chunk_rows, p.rows_per_group);
+        let first = group * p.rows_per_group as usize;
+        let rows = first + rows.start..first + rows.end;
+        let (d_weight, d_bias) = out.split_at_mut(outs * ins);
+        let d_y = &d_y[rows.start * outs..rows.end * outs];
+        let x = &x[rows.start * ins..rows.end * ins];
+        let size = [outs, ins, rows.len()];
+        product(size, d_weight, Matrix(d_y, [1, outs]), Matrix(x, [ins, 1]), p.accumulate == 1, threads);
+        if p.accumulate == 0 {
+            d_bias.fill(T::zero());
+        }
+        for d_y in d_y.chunks_exact(outs) {
+            d_bias.iter_mut().zip(d_y).for_each(|(sum, &d)| *sum += d);
+        }
+    };
+    let partial = &mut partial[..parts * parameters];
+    if parts == 1 {
+        return work(0, partial, Parallelism::Rayon(0));
+    }
+    partial.par_chunks_mut(parameters).enumerate().for_each(|(part, out)| work(part, out, Parallelism::None));
+}

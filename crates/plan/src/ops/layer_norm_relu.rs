@@ -1,0 +1,88 @@
+//! Layer normalisation with gamma and beta, then ReLU. Without affine, the caller binds gamma = 1, beta = 0.
+
+use srn_shaders::{
+    LAYER_NORM_RELU_BACKWARD_AFFINE, LAYER_NORM_RELU_BACKWARD_INPUT, LAYER_NORM_RELU_FORWARD, LayerNormParams,
+};
+
+use super::{overwrite, read, size, sum};
+use crate::{BufferId, Builder, PlanError};
+
+/// Rows per partial sum of [`backward_affine`].
+const CHUNK_ROWS: u32 = 256;
+
+/// What [`forward`] saved for the way back.
+#[derive(Clone, Copy, Debug)]
+pub struct Saved {
+    /// Input `[rows, features]`.
+    pub x: BufferId,
+    /// `[rows, 2]`: mean and 1 / standard deviation.
+    pub stats: BufferId,
+    /// `[2, features]`: gamma, beta.
+    pub affine: BufferId,
+}
+
+/// `x [rows, features]` → `y [rows, features]`; overwrites `saved.stats`.
+pub fn forward(b: &mut Builder, rows: u32, features: u32, saved: Saved, y: BufferId) -> Result<(), PlanError> {
+    let n = size([rows, features]);
+    let args = [
+        read(saved.x, n),
+        read(saved.affine, size([2, features])),
+        overwrite(y, n),
+        overwrite(saved.stats, size([rows, 2])),
+    ];
+    b.step(&LAYER_NORM_RELU_FORWARD, params(rows, features, 0, 0), &args, [rows, 1, 1], 3 * u64::from(features), 0)
+}
+
+/// `d_y` → `d_x`, both `[rows, features]`; overwrites.
+pub fn backward_input(
+    b: &mut Builder,
+    rows: u32,
+    features: u32,
+    saved: Saved,
+    d_y: BufferId,
+    d_x: BufferId,
+) -> Result<(), PlanError> {
+    let n = size([rows, features]);
+    let args = [
+        read(saved.x, n),
+        read(saved.stats, size([rows, 2])),
+        read(saved.affine, size([2, features])),
+        read(d_y, n),
+        overwrite(d_x, n),
+    ];
+    b.step(&LAYER_NORM_RELU_BACKWARD_INPUT, params(rows, features, 0, 0), &args, [rows, 1, 1], 2 * u64::from(features), 0)
+}
+
+/// Length of the partial sums of [`backward_affine`].
+pub fn partial_len(rows: u32, features: u32) -> usize {
+    size([rows.div_ceil(CHUNK_ROWS), 2, features])
+}
+
+/// `d_affine [2, features] (+)=` sums over the rows, by way of `partial`.
+pub fn backward_affine(
+    b: &mut Builder,
+    rows: u32,
+    features: u32,
+    saved: Saved,
+    d_y: BufferId,
+    partial: BufferId,
+    d_affine: BufferId,
+    accumulate: bool,
+) -> Result<(), PlanError> {
+    let n = size([rows, features]);
+    let chunks = rows.div_ceil(CHUNK_ROWS);
+    let args = [
+        read(saved.x, n),
+        read(saved.stats, size([rows, 2])),
+        read(saved.affine, size([2, features])),
+        read(d_y, n),
+        overwrite(partial, partial_len(rows, features)),
+    ];
+    let params = params(rows, features, CHUNK_ROWS, chunks);
+    b.step(&LAYER_NORM_RELU_BACKWARD_AFFINE, params, &args, [features, chunks, 1], CHUNK_ROWS.into(), 0)?;
+    sum::forward(b, sum::Groups::ONE, chunks, 2 * features, partial, d_affine, accumulate)
+}
+
+fn params(rows: u32, features: u32, chunk_rows: u32, chunks: u32) -> LayerNormParams {
+    LayerNormParams { rows, features, chunk_rows, chunks }
+}

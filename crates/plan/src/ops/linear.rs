@@ -1,0 +1,172 @@
+//! Linear layers, with one set of weights or one per instance. The work of the renderer is almost all here.
+
+use srn_shaders::{LINEAR_BACKWARD_INPUT, LINEAR_BACKWARD_WEIGHT, LINEAR_FORWARD, LinearParams};
+
+use super::{output, overwrite, read, size, sum};
+use crate::{BufferId, Builder, PlanError, Rows};
+
+/// Rows per partial sum of [`backward_weight`].
+const CHUNK_ROWS: u32 = 1024;
+/// Output features per dispatch of [`backward_input`]: bounds the loop of one invocation.
+const MOST_OUT: u32 = 16_384;
+
+/// A linear layer: its sizes and where its weights are.
+#[derive(Clone, Copy, Debug)]
+pub struct Layer {
+    /// `[sets, out·in + out]`: weight row-major, then bias.
+    pub weights: BufferId,
+    /// Values per input row.
+    pub in_features: u32,
+    /// Values per output row.
+    pub out_features: u32,
+    /// Number of sets of weights; with more than one, `slots` chooses.
+    pub sets: Sets,
+}
+
+/// Which weights a group of rows uses.
+#[derive(Clone, Copy, Debug)]
+pub enum Sets {
+    /// All groups share one set.
+    Shared,
+    /// Group `g` uses set `slots[first_group + g]` of `count`.
+    Slots {
+        /// Number of sets.
+        count: u32,
+    },
+}
+
+impl Layer {
+    /// Weight and bias together.
+    pub fn parameters(&self) -> u32 {
+        self.out_features * self.in_features + self.out_features
+    }
+
+    fn stride(&self) -> u32 {
+        match self.sets {
+            Sets::Shared => 0,
+            Sets::Slots { .. } => self.parameters(),
+        }
+    }
+
+    fn weights_len(&self) -> usize {
+        match self.sets {
+            Sets::Shared => size([self.parameters()]),
+            Sets::Slots { count } => size([count, self.parameters()]),
+        }
+    }
+
+    /// Groups do not matter to shared weights: one group of all rows makes the widest dispatch.
+    fn rows(&self, rows: Rows) -> Rows {
+        match self.sets {
+            Sets::Shared => Rows::plain(rows.count()),
+            Sets::Slots { .. } => rows,
+        }
+    }
+
+    fn params(&self, rows: Rows, accumulate: bool) -> LinearParams {
+        LinearParams {
+            groups: rows.groups,
+            rows_per_group: rows.rows_per_group,
+            first_group: rows.first_group,
+            in_features: self.in_features,
+            out_features: self.out_features,
+            weight_stride: self.stride(),
+            accumulate: accumulate.into(),
+            end_out: self.out_features,
+            ..Default::default()
+        }
+    }
+
+    fn flops(&self, rows: Rows) -> u64 {
+        2 * u64::from(rows.count()) * u64::from(self.in_features) * u64::from(self.out_features)
+    }
+}
+
+/// `y [rows, out] (+)= x [rows, in] Wᵀ + b`.
+pub fn forward(
+    b: &mut Builder,
+    rows: Rows,
+    layer: Layer,
+    x: BufferId,
+    slots: BufferId,
+    y: BufferId,
+    accumulate: bool,
+) -> Result<(), PlanError> {
+    let rows = layer.rows(rows);
+    let args = [
+        read(x, size([rows.count(), layer.in_features])),
+        read(layer.weights, layer.weights_len()),
+        read(slots, size([rows.first_group + rows.groups])),
+        output(y, size([rows.count(), layer.out_features]), accumulate),
+    ];
+    let extent = [rows.rows_per_group, layer.out_features, rows.groups];
+    let loops = u64::from(layer.in_features) + 64;
+    b.step(&LINEAR_FORWARD, layer.params(rows, accumulate), &args, extent, loops, layer.flops(rows))
+}
+
+/// `d_x [rows, in] (+)= d_y [rows, out] W`.
+pub fn backward_input(
+    b: &mut Builder,
+    rows: Rows,
+    layer: Layer,
+    d_y: BufferId,
+    slots: BufferId,
+    d_x: BufferId,
+    accumulate: bool,
+) -> Result<(), PlanError> {
+    let rows = layer.rows(rows);
+    for first_out in (0..layer.out_features).step_by(MOST_OUT as usize) {
+        let accumulate = accumulate || first_out > 0;
+        let end_out = layer.out_features.min(first_out + MOST_OUT);
+        let args = [
+            read(d_y, size([rows.count(), layer.out_features])),
+            read(layer.weights, layer.weights_len()),
+            read(slots, size([rows.first_group + rows.groups])),
+            output(d_x, size([rows.count(), layer.in_features]), accumulate),
+        ];
+        let params = LinearParams { first_out, end_out, ..layer.params(rows, accumulate) };
+        let extent = [rows.rows_per_group, layer.in_features, rows.groups];
+        let outs = u64::from(end_out - first_out);
+        let flops = 2 * u64::from(rows.count()) * u64::from(layer.in_features) * outs;
+        b.step(&LINEAR_BACKWARD_INPUT, params, &args, extent, outs + 64, flops)?;
+    }
+    Ok(())
+}
+
+/// Length of the partial sums of [`backward_weight`].
+pub fn partial_len(rows: Rows, layer: Layer) -> usize {
+    let rows = layer.rows(rows);
+    size([rows.groups, rows.rows_per_group.div_ceil(CHUNK_ROWS), layer.parameters()])
+}
+
+/// Gradient of the weights, `d_weights [sets, out·in + out]`, by way of `partial`; with per-instance weights group `g`
+/// writes set `first_group + g`, so every image has a set of its own.
+pub fn backward_weight(
+    b: &mut Builder,
+    rows: Rows,
+    layer: Layer,
+    x: BufferId,
+    d_y: BufferId,
+    partial: BufferId,
+    d_weights: BufferId,
+    accumulate: bool,
+) -> Result<(), PlanError> {
+    let rows = layer.rows(rows);
+    let chunks = rows.rows_per_group.div_ceil(CHUNK_ROWS);
+    let direct = chunks == 1 && rows.first_group == 0;
+    let len = partial_len(rows, layer);
+    let args = [
+        read(x, size([rows.count(), layer.in_features])),
+        read(d_y, size([rows.count(), layer.out_features])),
+        if direct { output(d_weights, len, accumulate) } else { overwrite(partial, len) },
+    ];
+    let chunk_rows = CHUNK_ROWS.min(rows.rows_per_group);
+    let params = LinearParams { chunk_rows, chunks, ..layer.params(rows, direct && accumulate) };
+    let extent = [layer.out_features, layer.in_features, rows.groups * chunks];
+    b.step(&LINEAR_BACKWARD_WEIGHT, params, &args, extent, u64::from(chunk_rows) + 64, layer.flops(rows))?;
+    if direct {
+        return Ok(());
+    }
+    let groups = sum::Groups { count: rows.groups, first: rows.first_group };
+    sum::forward(b, groups, chunks, layer.parameters(), partial, d_weights, accumulate)
+}

@@ -1,0 +1,157 @@
+//! Cameras and poses (spec 1): OpenCV axes, `world_from_camera`, world z up, the object at the origin.
+
+use glam::{DMat3, DMat4, DVec3};
+
+/// Pinhole intrinsics in pixels, with the place of a pixel's centre.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Intrinsics {
+    /// Focal length along u.
+    pub fx: f64,
+    /// Focal length along v.
+    pub fy: f64,
+    /// Principal point, u.
+    pub cx: f64,
+    /// Principal point, v.
+    pub cy: f64,
+    /// What is added to a pixel's integer coordinates to get its centre: 0 for SRN data, 0.5 for COLMAP and OpenGL.
+    pub pixel_center: f64,
+}
+
+impl Intrinsics {
+    /// The four numbers as the kernels take them.
+    pub fn to_array(&self) -> [f32; 4] {
+        [self.fx, self.fy, self.cx, self.cy].map(|value| value as f32)
+    }
+}
+
+/// The six numbers that pose estimation moves (spec 1): three angles in radians, `R = Rx(θ1)·Ry(θ2)·Rz(θ3)`, then the camera
+/// centre in object units.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pose6(pub [f64; 6]);
+
+impl Pose6 {
+    /// `world_from_camera` as a 4×4 matrix.
+    pub fn to_matrix(self) -> DMat4 {
+        let [a, b, c, x, y, z] = self.0;
+        let rotation = DMat3::from_rotation_x(a) * DMat3::from_rotation_y(b) * DMat3::from_rotation_z(c);
+        let mut matrix = DMat4::from_mat3(rotation);
+        matrix.w_axis = DVec3::new(x, y, z).extend(1.0);
+        matrix
+    }
+
+    /// The six numbers of a rigid `world_from_camera`; at θ2 = ±90° the one with θ3 = 0.
+    pub fn from_matrix(world_from_camera: &DMat4) -> Self {
+        let r = |row: usize, column: usize| world_from_camera.col(column)[row];
+        let (a, c) = if r(0, 2).abs() < 1.0 - 1e-12 {
+            ((-r(1, 2)).atan2(r(2, 2)), (-r(0, 1)).atan2(r(0, 0)))
+        } else {
+            (r(2, 1).atan2(r(1, 1)), 0.0)
+        };
+        let t = world_from_camera.w_axis;
+        Pose6([a, r(0, 2).clamp(-1.0, 1.0).asin(), c, t.x, t.y, t.z])
+    }
+
+    /// As the kernels take it.
+    pub fn to_f32(self) -> [f32; 6] {
+        self.0.map(|value| value as f32)
+    }
+}
+
+/// A camera at `eye` that looks at the origin without roll: its y axis points down in the world as far as possible.
+pub fn look_at_origin(eye: DVec3) -> DMat4 {
+    let forward = -eye.normalize();
+    let side = forward.cross(DVec3::Z);
+    // Straight above or below, every roll is as good: take the world's x axis to the right.
+    let right = if side.length() < 1e-9 { DVec3::X } else { side.normalize() };
+    DMat4::from_cols(right.extend(0.0), forward.cross(right).extend(0.0), forward.extend(0.0), eye.extend(1.0))
+}
+
+/// Starts `fixed24` (spec 4): 8 azimuths × elevations 45°, 0°, −45° at `radius`, looking at the origin.
+pub fn fixed24(radius: f64) -> Vec<DMat4> {
+    [45.0f64, 0.0, -45.0]
+        .into_iter()
+        .flat_map(|elevation| {
+            (0..8).map(move |k| {
+                let (azimuth, elevation) = (f64::from(k) * std::f64::consts::FRAC_PI_4, elevation.to_radians());
+                let horizontal = elevation.cos();
+                look_at_origin(radius * DVec3::new(horizontal * azimuth.cos(), horizontal * azimuth.sin(), elevation.sin()))
+            })
+        })
+        .collect()
+}
+
+/// Starts `neighbor4` (spec 4): the rough pose turned about the world origin by 30°, down and up about its own x axis, right and
+/// left about the world's z axis.
+pub fn neighbor4(rough: &DMat4) -> Vec<DMat4> {
+    let own_x = rough.x_axis.truncate().normalize();
+    [(own_x, -30.0f64), (own_x, 30.0), (DVec3::Z, 30.0), (DVec3::Z, -30.0)]
+        .into_iter()
+        .map(|(axis, degrees)| DMat4::from_axis_angle(axis, degrees.to_radians()) * *rough)
+        .collect()
+}
+
+/// Errors of an estimate (spec 4): rotation in degrees, translation in object units.
+pub fn pose_error(estimate: &DMat4, truth: &DMat4) -> (f64, f64) {
+    let relative = DMat3::from_mat4(*estimate) * DMat3::from_mat4(*truth).transpose();
+    let trace = relative.x_axis.x + relative.y_axis.y + relative.z_axis.z;
+    let rotation = ((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees();
+    (rotation, (estimate.w_axis - truth.w_axis).truncate().length())
+}
+
+/// Row-major 3×4, as the kernels take it.
+pub fn to_rows(matrix: &DMat4) -> [f64; 12] {
+    let mut rows = [0.0; 12];
+    for row in 0..3 {
+        for column in 0..4 {
+            rows[4 * row + column] = matrix.col(column)[row];
+        }
+    }
+    rows
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_matrix_is_the_one_in_the_specification() {
+        let angles = [0.3, -0.7, 1.1];
+        let [(s1, c1), (s2, c2), (s3, c3)] = angles.map(f64::sin_cos);
+        let m = Pose6([0.3, -0.7, 1.1, 1.0, 2.0, 3.0]).to_matrix();
+        let expected = [
+            [c2 * c3, -c2 * s3, s2, 1.0],
+            [c1 * s3 + c3 * s1 * s2, c1 * c3 - s1 * s2 * s3, -c2 * s1, 2.0],
+            [s1 * s3 - c1 * c3 * s2, c3 * s1 + c1 * s2 * s3, c1 * c2, 3.0],
+        ];
+        for row in 0..3 {
+            for column in 0..4 {
+                assert!((m.col(column)[row] - expected[row][column]).abs() < 1e-12, "{row} {column}");
+            }
+        }
+    }
+
+    #[test]
+    fn six_numbers_and_matrix_are_inverse_to_each_other() {
+        let mut poses = fixed24(1.3);
+        poses.extend(neighbor4(&look_at_origin(DVec3::new(0.4, 0.9, -0.8))));
+        for matrix in poses {
+            let again = Pose6::from_matrix(&matrix).to_matrix();
+            assert!(again.abs_diff_eq(matrix, 1e-7), "{matrix} {again}");
+            assert!((matrix.determinant() - 1.0).abs() < 1e-12);
+            let origin = matrix.inverse().transform_point3(DVec3::ZERO);
+            assert!(origin.x.abs() < 1e-9 && origin.y.abs() < 1e-9 && origin.z > 0.0, "the origin is on the optical axis");
+        }
+    }
+
+    #[test]
+    fn errors_of_a_known_rotation() {
+        let truth = look_at_origin(DVec3::new(1.0, 0.5, 0.7));
+        for start in neighbor4(&truth) {
+            let (rotation, translation) = pose_error(&start, &truth);
+            assert!((rotation - 30.0).abs() < 1e-9 && translation > 0.2);
+        }
+        assert_eq!(pose_error(&truth, &truth).1, 0.0);
+        let (up, down) = (neighbor4(&truth)[1], neighbor4(&truth)[0]);
+        assert!(up.w_axis.z > truth.w_axis.z && down.w_axis.z < truth.w_axis.z, "up is up");
+    }
+}

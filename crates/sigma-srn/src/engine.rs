@@ -1,0 +1,209 @@
+//! Where plans run: a GPU through wgpu, or the CPU.
+
+use std::time::Instant;
+
+use srn_cpu::CpuExecutor;
+use srn_gpu::{Gpu, GpuExecutor};
+use srn_plan::ops::linear::{self, Layer, Sets};
+use srn_plan::{Builder, Executor, ExecutorError, Plan, PlanError, Rows};
+
+use crate::Error;
+
+/// Memory that a plan may take on the CPU where the user sets no budget, in bytes.
+const CPU_BUDGET: u64 = 2 << 30;
+/// Rows of a tile on the CPU: the working set of a layer stays in the caches.
+const CPU_TILE_ROWS: u32 = 1024;
+/// Rows of a tile on a GPU: enough to fill a large one.
+const GPU_TILE_ROWS: u32 = 32_768;
+
+/// What computes.
+#[derive(Clone, Debug)]
+enum Kind {
+    Cpu,
+    CpuF64,
+    Gpu(Gpu),
+}
+
+/// A place to run plans, with a memory budget. Cheap to clone.
+#[derive(Clone, Debug)]
+pub struct Engine {
+    kind: Kind,
+    budget: u64,
+    tile_rows: u32,
+}
+
+impl Engine {
+    /// The CPU in `f32`, with all threads of the current rayon pool.
+    pub fn cpu() -> Self {
+        Engine { kind: Kind::Cpu, budget: CPU_BUDGET, tile_rows: CPU_TILE_ROWS }
+    }
+
+    /// The CPU in `f64`: the oracle of the tests.
+    pub fn cpu_f64() -> Self {
+        Engine { kind: Kind::CpuF64, ..Self::cpu() }
+    }
+
+    /// A GPU, or a software adapter: opened by [`Gpu::open`], or made from the caller's device by [`Gpu::from_device`].
+    pub fn gpu(gpu: Gpu) -> Self {
+        let budget = gpu.default_memory_budget();
+        Engine { kind: Kind::Gpu(gpu), budget, tile_rows: GPU_TILE_ROWS }
+    }
+
+    /// The GPU where there is an adapter that is not a software one, else whichever executor is faster on a small matrix
+    /// product on this machine. Also says which it took and why.
+    pub fn automatic() -> (Self, String) {
+        let gpu = match Gpu::open(None) {
+            Ok(gpu) => gpu,
+            Err(error) => return (Self::cpu(), format!("CPU executor: {error}")),
+        };
+        let name = gpu.adapter().name;
+        if !gpu.adapter().is_software {
+            return (Self::gpu(gpu), format!("GPU executor on {name}"));
+        }
+        let (cpu, software) = (Self::cpu(), Self::gpu(gpu));
+        match (cpu.matrix_product_seconds(), software.matrix_product_seconds()) {
+            (Ok(cpu_time), Ok(software_time)) if software_time < cpu_time => {
+                (software, format!("GPU executor on {name}: {:.1} times the CPU executor's speed here", cpu_time / software_time))
+            }
+            (Ok(cpu_time), Ok(software_time)) => {
+                (cpu, format!("CPU executor: {:.1} times the speed of {name} here", software_time / cpu_time))
+            }
+            (_, Err(error)) => (cpu, format!("CPU executor: {name} failed ({error})")),
+            (Err(_), _) => (software, format!("GPU executor on {name}")),
+        }
+    }
+
+    /// The same with another memory budget, in bytes.
+    pub fn with_budget(self, budget: u64) -> Self {
+        Engine { budget, ..self }
+    }
+
+    /// The same with at most `rows` rays in flight.
+    pub fn with_tile_rows(self, rows: u32) -> Self {
+        Engine { tile_rows: rows.max(1), ..self }
+    }
+
+    /// The memory budget in bytes.
+    pub fn budget(&self) -> u64 {
+        self.budget
+    }
+
+    /// The GPU, if it is one.
+    pub fn as_gpu(&self) -> Option<&Gpu> {
+        match &self.kind {
+            Kind::Gpu(gpu) => Some(gpu),
+            Kind::Cpu | Kind::CpuF64 => None,
+        }
+    }
+
+    /// A builder with this engine's limits.
+    pub(crate) fn builder(&self) -> Builder {
+        Builder::new(match &self.kind {
+            Kind::Gpu(gpu) => gpu.max_binding_bytes(),
+            Kind::Cpu | Kind::CpuF64 => u64::MAX,
+        })
+    }
+
+    /// Builds a plan with the largest tiles that fit the budget and the device's limits; `build` gets the rows of a tile.
+    pub(crate) fn fit<T>(&self, rows: u32, build: impl Fn(u32) -> Result<(Plan, T), PlanError>) -> Result<(Plan, T), Error> {
+        let mut tile_rows = rows.min(self.tile_rows).max(1);
+        loop {
+            let needed = match build(tile_rows) {
+                Ok((plan, rest)) if self.bytes(&plan) <= self.budget => return Ok((plan, rest)),
+                Ok((plan, _)) => self.bytes(&plan),
+                Err(PlanError::TooLarge { .. }) if tile_rows > 1 => u64::MAX,
+                Err(error) => return Err(error.into()),
+            };
+            if tile_rows == 1 {
+                return Err(Error::Budget { budget: self.budget, needed });
+            }
+            tile_rows = (tile_rows * 3 / 4).max(1);
+        }
+    }
+
+    fn bytes(&self, plan: &Plan) -> u64 {
+        plan.bytes() * if matches!(self.kind, Kind::CpuF64) { 2 } else { 1 }
+    }
+
+    /// Makes a plan ready to run.
+    pub(crate) fn prepare(&self, plan: Plan) -> Result<Runner, ExecutorError> {
+        Ok(match &self.kind {
+            Kind::Cpu => Runner::Cpu(CpuExecutor::new(plan, self.budget)?),
+            Kind::CpuF64 => Runner::CpuF64(CpuExecutor::new(plan, self.budget)?),
+            Kind::Gpu(gpu) => Runner::Gpu(GpuExecutor::new(gpu, plan, self.budget)?),
+        })
+    }
+
+    /// Seconds of the best of three products of 4096 rows with 128 × 128 weights, after a first one that compiles.
+    fn matrix_product_seconds(&self) -> Result<f64, Error> {
+        const ROWS: u32 = 4096;
+        const WIDTH: u32 = 128;
+        let mut b = self.builder();
+        let weights = b.input("weights", (WIDTH * WIDTH + WIDTH) as usize)?;
+        let (x, y) = (b.input("x", (ROWS * WIDTH) as usize)?, b.scratch("y", (ROWS * WIDTH) as usize)?);
+        let slots = b.input_u32("slots", 1)?;
+        let layer = Layer { weights, in_features: WIDTH, out_features: WIDTH, sets: Sets::Shared };
+        let stage = b.stage("product");
+        linear::forward(&mut b, Rows::plain(ROWS), layer, x, slots, y, false)?;
+        let mut runner = self.prepare(b.finish()?)?;
+        let mut best = f64::INFINITY;
+        for round in 0..4 {
+            let start = Instant::now();
+            runner.run(stage)?;
+            runner.read(y)?;
+            if round > 0 {
+                best = best.min(start.elapsed().as_secs_f64());
+            }
+        }
+        Ok(best)
+    }
+}
+
+impl std::fmt::Display for Engine {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match &self.kind {
+            Kind::Cpu => write!(f, "cpu"),
+            Kind::CpuF64 => write!(f, "cpu64"),
+            Kind::Gpu(gpu) => write!(f, "{}", gpu.adapter().name),
+        }
+    }
+}
+
+/// A plan on its executor.
+pub(crate) enum Runner {
+    Cpu(CpuExecutor<f32>),
+    CpuF64(CpuExecutor<f64>),
+    Gpu(GpuExecutor),
+}
+
+impl Runner {
+    /// The GPU executor, if it is one.
+    pub fn as_gpu(&self) -> Option<&GpuExecutor> {
+        match self {
+            Runner::Gpu(executor) => Some(executor),
+            Runner::Cpu(_) | Runner::CpuF64(_) => None,
+        }
+    }
+}
+
+impl std::ops::Deref for Runner {
+    type Target = dyn Executor;
+
+    fn deref(&self) -> &Self::Target {
+        match self {
+            Runner::Cpu(executor) => executor,
+            Runner::CpuF64(executor) => executor,
+            Runner::Gpu(executor) => executor,
+        }
+    }
+}
+
+impl std::ops::DerefMut for Runner {
+    fn deref_mut(&mut self) -> &mut Self::Target {
+        match self {
+            Runner::Cpu(executor) => executor,
+            Runner::CpuF64(executor) => executor,
+            Runner::Gpu(executor) => executor,
+        }
+    }
+}

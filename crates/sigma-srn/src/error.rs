@@ -1,0 +1,76 @@
+use std::path::PathBuf;
+
+use srn_plan::{ExecutorError, PlanError};
+
+/// What can go wrong in this library.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A file that cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A model file that is not safetensors.
+    #[error("{}: not a safetensors file: {what}", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+    /// A tensor that a model needs is not there.
+    #[error("tensor `{name}` is missing")]
+    MissingTensor {
+        /// Its name.
+        name: String,
+    },
+    /// A tensor of the wrong shape or type.
+    #[error("tensor `{name}`: expected {expected}, got {got}")]
+    Tensor {
+        /// Its name.
+        name: String,
+        /// Shape and type that fit.
+        expected: String,
+        /// Shape and type that are there.
+        got: String,
+    },
+    /// A setting that makes no sense.
+    #[error("{field}: {what}")]
+    Setting {
+        /// The setting.
+        field: &'static str,
+        /// Why.
+        what: String,
+    },
+    /// Input of the wrong size, or with values that are not finite.
+    #[error("{input}: {what}")]
+    Input {
+        /// Which input.
+        input: String,
+        /// What is wrong, with both numbers.
+        what: String,
+    },
+    /// The memory budget is too small for even one ray.
+    #[error("the memory budget of {budget} bytes is too small: parameters and one row need {needed}")]
+    Budget {
+        /// The budget.
+        budget: u64,
+        /// The least that works.
+        needed: u64,
+    },
+    /// Training met a loss that is not a number.
+    #[error("step {step}: the loss is not finite; lower the learning rate")]
+    Diverged {
+        /// The training step.
+        step: u64,
+    },
+    /// A mistake in a plan: a bug here, or a model with shapes that do not fit.
+    #[error(transparent)]
+    Plan(#[from] PlanError),
+    /// The executor failed.
+    #[error(transparent)]
+    Executor(#[from] ExecutorError),
+}

@@ -1,0 +1,271 @@
+//! Pose estimation (spec 4): many starts per image in one batch, the unpromising ones dropped between phases.
+
+use glam::DMat4;
+use serde::Serialize;
+
+use crate::camera::{Intrinsics, Pose6};
+use crate::descent::{Descent, Loss, Shape};
+use crate::engine::Engine;
+use crate::model::Model;
+use crate::random::{initial_depths, stream};
+use crate::{Error, Rays, pixel_grid};
+
+/// An image whose camera pose is wanted.
+#[derive(Clone, Debug)]
+pub struct Query {
+    /// Number of the instance that it shows.
+    pub instance: u32,
+    /// Colours in [-1, 1], `[height, width, 3]`, white background.
+    pub rgb: Vec<f32>,
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Intrinsics of this image.
+    pub intrinsics: Intrinsics,
+    /// Where the search starts: `world_from_camera`.
+    pub starts: Vec<DMat4>,
+}
+
+/// Some steps with the same settings.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Phase {
+    /// Steps of Adam.
+    pub steps: u32,
+    /// Every how many pixels, in both directions, a ray is cast.
+    pub stride: u32,
+    /// Learning rate of the first step and of the last; between them it falls along half a cosine.
+    pub learning_rate: (f64, f64),
+    /// How many hypotheses of each image enter this phase: those with the lowest loss.
+    pub keep: usize,
+}
+
+/// How poses are estimated.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Options {
+    /// How render and image are compared.
+    pub loss: Loss,
+    /// Phases, one after the other.
+    pub phases: Vec<Phase>,
+    /// True: a hypothesis ends at its best step; false: at its last, as in the paper.
+    pub keep_best: bool,
+    /// Seed of the initial depths.
+    pub seed: u64,
+}
+
+impl Options {
+    /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
+    pub fn paper() -> Self {
+        let phase = Phase { steps: 300, stride: 1, learning_rate: (0.1, 0.1), keep: usize::MAX };
+        Options { loss: Loss::Mae, phases: vec![phase], keep_best: false, seed: 0 }
+    }
+
+    /// All starts on few rays, the most promising ones on more, the best few to the end.
+    pub fn culled() -> Self {
+        let phases = vec![
+            Phase { steps: 40, stride: 4, learning_rate: (0.1, 0.1), keep: usize::MAX },
+            Phase { steps: 60, stride: 2, learning_rate: (0.1, 0.05), keep: 6 },
+            Phase { steps: 150, stride: 2, learning_rate: (0.05, 0.002), keep: 2 },
+        ];
+        Options { loss: Loss::Mae, phases, keep_best: true, seed: 0 }
+    }
+}
+
+/// Where one start ended.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Ranked {
+    /// Number of the start in [`Query::starts`].
+    pub start: usize,
+    /// Its loss when it was dropped, or at the end.
+    pub loss: f64,
+    /// Phases that it went through.
+    pub phases: usize,
+    /// Its pose then.
+    #[serde(skip)]
+    pub pose: Pose6,
+}
+
+/// An estimated pose.
+#[derive(Clone, Debug)]
+pub struct Estimate {
+    /// The pose of the winning start.
+    pub pose: Pose6,
+    /// Its loss.
+    pub loss: f64,
+    /// All starts, the winner first: more phases before fewer, then by loss.
+    pub ranking: Vec<Ranked>,
+}
+
+/// What an observer of [`estimate`] sees after every step.
+pub struct Progress<'a> {
+    /// Steps done, over all phases.
+    pub step: u32,
+    /// Steps in all.
+    pub steps: u32,
+    /// `(query, start)` of each hypothesis in the running phase.
+    pub hypotheses: &'a [(usize, usize)],
+    /// The running descent; reading from it waits for the device.
+    pub descent: &'a mut Descent,
+}
+
+/// Hypothesis on its way.
+#[derive(Clone, Copy, Debug)]
+struct Hypothesis {
+    query: usize,
+    start: usize,
+    pose: Pose6,
+    loss: f64,
+    phases: usize,
+}
+
+/// Estimates the poses of all queries in one batch. `observe` is called after every step.
+pub fn estimate(
+    engine: &Engine,
+    model: &Model,
+    queries: &[Query],
+    options: &Options,
+    mut observe: impl FnMut(Progress) -> Result<(), Error>,
+) -> Result<Vec<Estimate>, Error> {
+    check(model, queries, options)?;
+    let steps = options.phases.iter().map(|phase| phase.steps).sum();
+    let mut step = 0;
+    let mut hypotheses: Vec<Hypothesis> = Vec::new();
+    for (query, q) in queries.iter().enumerate() {
+        let new = |(start, matrix)| Hypothesis { query, start, pose: Pose6::from_matrix(matrix), loss: f64::MAX, phases: 0 };
+        hypotheses.extend(q.starts.iter().enumerate().map(new));
+    }
+
+    for (number, phase) in options.phases.iter().enumerate() {
+        let mut running: Vec<Hypothesis> = Vec::new();
+        let mut dropped: Vec<Hypothesis> = Vec::new();
+        for query in 0..queries.len() {
+            let mut own: Vec<Hypothesis> = hypotheses.iter().copied().filter(|h| h.query == query && h.phases == number).collect();
+            own.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+            let rest = own.split_off(phase.keep.min(own.len()));
+            running.extend(own);
+            dropped.extend(rest);
+        }
+        dropped.extend(hypotheses.iter().filter(|h| h.phases < number));
+        let names: Vec<(usize, usize)> = running.iter().map(|h| (h.query, h.start)).collect();
+        let mut descent = prepare(engine, model, queries, options, phase, &running)?;
+        let rows = running.len() * rays_of(&queries[0], phase.stride).count();
+        for k in 0..phase.steps {
+            let mut random = stream(options.seed, 1 + u64::from(step));
+            descent.set_initial_depths(&initial_depths(&mut random, rows))?;
+            descent.evaluate()?;
+            descent.descend(learning_rate(phase, k))?;
+            step += 1;
+            observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
+        }
+        descent.evaluate()?;
+        let last: Vec<(f64, Pose6)> = descent.losses()?.into_iter().zip(descent.poses()?).collect();
+        let best = descent.best()?;
+        for ((hypothesis, last), best) in running.iter_mut().zip(last).zip(best) {
+            let take_best = options.keep_best && (best.0 <= last.0 || !last.0.is_finite());
+            (hypothesis.loss, hypothesis.pose) = if take_best { best } else { last };
+            if !hypothesis.loss.is_finite() {
+                hypothesis.loss = f64::MAX;
+            }
+            hypothesis.phases = number + 1;
+        }
+        hypotheses = running;
+        hypotheses.extend(dropped);
+    }
+
+    let mut estimates = Vec::new();
+    for query in 0..queries.len() {
+        let own = hypotheses.iter().filter(|h| h.query == query);
+        let mut ranking: Vec<Ranked> =
+            own.map(|h| Ranked { start: h.start, loss: h.loss, phases: h.phases, pose: h.pose }).collect();
+        ranking.sort_by(|a, b| b.phases.cmp(&a.phases).then(a.loss.total_cmp(&b.loss)));
+        estimates.push(Estimate { pose: ranking[0].pose, loss: ranking[0].loss, ranking });
+    }
+    Ok(estimates)
+}
+
+fn rays_of(query: &Query, stride: u32) -> impl Iterator<Item = (u32, u32)> {
+    pixel_grid(query.width, query.height, stride)
+}
+
+/// From `learning_rate.0` at the first step to `.1` at the last, along half a cosine.
+fn learning_rate(phase: &Phase, step: u32) -> f64 {
+    let (first, last) = phase.learning_rate;
+    let progress = f64::from(step) / f64::from(phase.steps.saturating_sub(1).max(1));
+    last + (first - last) * 0.5 * (1.0 + (std::f64::consts::PI * progress).cos())
+}
+
+fn prepare(
+    engine: &Engine,
+    model: &Model,
+    queries: &[Query],
+    options: &Options,
+    phase: &Phase,
+    running: &[Hypothesis],
+) -> Result<Descent, Error> {
+    let mut instances: Vec<u32> = running.iter().map(|h| queries[h.query].instance).collect();
+    instances.sort_unstable();
+    instances.dedup();
+    let mut random = stream(options.seed, 0);
+    let (mut slots, mut rays, mut target) = (Vec::new(), Rays::default(), Vec::new());
+    for hypothesis in running {
+        let query = &queries[hypothesis.query];
+        slots.push(instances.binary_search(&query.instance).expect("collected above") as u32);
+        rays.push(&DMat4::IDENTITY, &query.intrinsics, rays_of(query, phase.stride), &mut random);
+        for (u, v) in rays_of(query, phase.stride) {
+            let pixel = 3 * (v * query.width + u) as usize;
+            target.extend_from_slice(&query.rgb[pixel..pixel + 3]);
+        }
+    }
+    let across = |size: u32| (phase.stride / 2..size).step_by(phase.stride as usize).count() as u32;
+    let shape = Shape {
+        hypotheses: running.len() as u32,
+        width: across(queries[0].width),
+        height: across(queries[0].height),
+        instances: instances.len() as u32,
+    };
+    let mut descent = Descent::new(engine, model, shape, options.loss)?;
+    descent.set_targets(&instances, &slots, &rays, &target)?;
+    descent.set_poses(&running.iter().map(|h| h.pose).collect::<Vec<_>>())?;
+    Ok(descent)
+}
+
+fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Error> {
+    let setting = |field, what: &str| Err(Error::Setting { field, what: what.into() });
+    if queries.is_empty() {
+        return setting("queries", "there are none");
+    }
+    if options.phases.is_empty() {
+        return setting("phases", "there are none");
+    }
+    for phase in &options.phases {
+        if phase.stride == 0 || phase.keep == 0 {
+            return setting("phases", "stride and keep must be at least 1");
+        }
+        if options.loss == Loss::Gmsd && phase.stride != 1 {
+            return setting("loss", "GMSD compares neighbouring pixels: it needs stride 1 in every phase");
+        }
+    }
+    for (number, query) in queries.iter().enumerate() {
+        let input = |what: String| Err(Error::Input { input: format!("image {number}"), what });
+        if query.rgb.len() != 3 * query.width as usize * query.height as usize || query.rgb.is_empty() {
+            return input(format!("{} values for {} × {} pixels of 3", query.rgb.len(), query.width, query.height));
+        }
+        if [query.width, query.height] != [queries[0].width, queries[0].height] {
+            let first = &queries[0];
+            return input(format!("{} × {}, but the first is {} × {}", query.width, query.height, first.width, first.height));
+        }
+        if query.instance >= model.layout.instances {
+            return input(format!("instance {}, but the model has {}", query.instance, model.layout.instances));
+        }
+        if query.starts.is_empty() {
+            return input("no starts".into());
+        }
+        if query.starts.iter().any(|start| !start.is_finite()) {
+            return input("a start has values that are not finite".into());
+        }
+        if options.phases.iter().any(|phase| rays_of(query, phase.stride).next().is_none()) {
+            return input(format!("a stride larger than {} × {} pixels", query.width, query.height));
+        }
+    }
+    Ok(())
+}

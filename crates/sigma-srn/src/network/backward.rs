@@ -1,0 +1,226 @@
+//! Backward pass: [`super::forward`] in reverse.
+
+use srn_plan::ops::layer_norm_relu::Saved as NormSaved;
+use srn_plan::ops::{advance, density_sum, embedding, layer_norm_relu, linear, lstm_cell, rays};
+use srn_plan::{BufferId, Builder, PlanError, Rows, Tile};
+
+use super::{BlockBuffers, BlockSaved, HyperSaved, Network, Saved, Scratch, Started};
+
+/// Partial sums of weight gradients: one buffer, large enough for every layer.
+pub(crate) fn partial_len(network: &Network, rows: Rows) -> usize {
+    let density = network.density.iter().flatten();
+    let marcher = [&network.lstm_input, &network.lstm_hidden, &network.step_head];
+    let blocks = network.scene.iter().chain(density).chain(&network.pixel_generator).chain(marcher);
+    let tile = blocks.map(|block| block_partial_len(block, rows)).max().unwrap_or(0);
+    let slots = Rows::plain(network.batch.slots);
+    let hyper = network.hyper.iter().flatten().map(|block| block_partial_len(block, slots)).max().unwrap_or(0);
+    tile.max(hyper).max(rays::partial_len(rows))
+}
+
+fn block_partial_len(block: &BlockBuffers, rows: Rows) -> usize {
+    let norm = layer_norm_relu::partial_len(rows.count(), block.layer.out_features);
+    let weights = if block.d_weights.is_some() { linear::partial_len(rows, block.layer) } else { 0 };
+    weights.max(if block.d_affine.is_some() { norm } else { 0 })
+}
+
+/// Where a gradient goes, and whether it is added.
+#[derive(Clone, Copy)]
+struct Into {
+    buffer: BufferId,
+    accumulate: bool,
+}
+
+/// Scratch inside an MLP: gradient towards `y` (holds the incoming gradient at first), gradient towards `z`, partial sums.
+#[derive(Clone, Copy)]
+struct Inside {
+    d_y: BufferId,
+    d_z: BufferId,
+    partial: BufferId,
+}
+
+/// From `d_rgb` of the tile (in `scratch.d_rgb`) to `scratch.d_origin` and `scratch.d_direction` of its rays, and to the weights
+/// that have gradients. `d_end`: whether `scratch.d_origin` already holds a gradient of the end points (the depth term).
+pub(crate) fn render(
+    b: &mut Builder,
+    network: &Network,
+    saved: &Saved,
+    scratch: &Scratch,
+    partial: BufferId,
+    tile: Tile,
+    d_end: bool,
+    started: &mut Started,
+) -> Result<(), PlanError> {
+    let rows = tile.rows;
+    let n = rows.count();
+    let features = network.features();
+    let last = network.tracing_steps as usize;
+    // x_{i+1} = x_i + …: one buffer carries d_x from the end point to the origin.
+    let d_x = scratch.d_origin;
+    let inside = Inside { d_y: scratch.d_y, d_z: scratch.d_z, partial };
+    started.restart(d_x, 0);
+    started.restart(scratch.d_direction, 0);
+    if d_end {
+        started.accumulate(d_x, 0);
+    }
+
+    let d_phi = Into { buffer: scratch.d_phi, accumulate: false };
+    mlp(b, network, rows, &network.pixel_generator, saved.phi, &saved.pixel_generator, scratch.d_rgb, inside, Some(d_phi), started)?;
+
+    for i in (0..=last).rev() {
+        let v = saved.scene[i].last().expect("f has layers").y;
+        // The gradient of v_i: from the sum …
+        let mut d_v = (i == last).then_some(scratch.d_phi);
+        if let Some(density) = &network.density {
+            let g = saved.density[i].last().expect("g has layers").y;
+            density_sum::backward(b, n, features, g, v, scratch.d_phi, scratch.d_density, scratch.d_y)?;
+            d_v = Some(scratch.d_y);
+            // … and, before anything else touches d_x, from the marcher.
+            if i < last {
+                marcher(b, network, saved, scratch, partial, rows, i, d_v, started)?;
+            }
+            let inside = Inside { d_y: scratch.d_density_y, ..inside };
+            let into = Into { buffer: d_x, accumulate: started.accumulate(d_x, 0) };
+            mlp(b, network, rows, density, saved.x[i], &saved.density[i], scratch.d_density, inside, Some(into), started)?;
+        } else if i < last {
+            marcher(b, network, saved, scratch, partial, rows, i, None, started)?;
+            d_v = Some(scratch.d_y);
+        }
+        let d_v = d_v.expect("set on every path");
+        let into = Into { buffer: d_x, accumulate: started.accumulate(d_x, 0) };
+        let inside = Inside { d_y: d_v, ..inside };
+        mlp(b, network, rows, &network.scene, saved.x[i], &saved.scene[i], d_v, inside, Some(into), started)?;
+    }
+    Ok(())
+}
+
+/// Step `i` of the marcher: from `d_x` of `x_{i+1}` to `d_step`, `d_h`, the gates, and on to `scratch.d_y`, the gradient of `v_i`
+/// (added to what is there if `d_v` is given).
+fn marcher(
+    b: &mut Builder,
+    network: &Network,
+    saved: &Saved,
+    scratch: &Scratch,
+    partial: BufferId,
+    rows: Rows,
+    i: usize,
+    d_v: Option<BufferId>,
+    started: &mut Started,
+) -> Result<(), PlanError> {
+    let n = rows.count();
+    let steps = network.tracing_steps as usize;
+    let v = saved.scene[i].last().expect("f has layers").y;
+    let first = i + 1 == steps;
+    let accumulate = started.accumulate(scratch.d_direction, 0);
+    advance::backward(b, n, saved.direction, saved.step[i], scratch.d_origin, scratch.d_step, scratch.d_direction, accumulate)?;
+    weights(b, rows, &network.step_head, saved.h[i + 1], scratch.d_step, partial, started)?;
+    linear::backward_input(b, rows, network.step_head.layer, scratch.d_step, network.slots, scratch.d_h, !first)?;
+
+    let d_c = if first { scratch.zero_state } else { scratch.d_c[(i + 1) % 2] };
+    let d_c_prev = scratch.d_c[i % 2];
+    let (gates, d_gates) = (saved.gates[i], scratch.d_gates);
+    lstm_cell::backward(b, n, network.lstm_size(), gates, saved.c[i], saved.c[i + 1], scratch.d_h, d_c, d_gates, d_c_prev)?;
+    weights(b, rows, &network.lstm_hidden, saved.h[i], d_gates, partial, started)?;
+    weights(b, rows, &network.lstm_input, v, d_gates, partial, started)?;
+    if i > 0 {
+        linear::backward_input(b, rows, network.lstm_hidden.layer, d_gates, network.slots, scratch.d_h, false)?;
+    }
+    linear::backward_input(b, rows, network.lstm_input.layer, d_gates, network.slots, scratch.d_y, d_v.is_some())
+}
+
+/// Layers in reverse. `d` is the gradient of the last output; it is left unchanged where it is neither `inside.d_y` nor `d_z`.
+fn mlp(
+    b: &mut Builder,
+    network: &Network,
+    rows: Rows,
+    blocks: &[BlockBuffers],
+    x: BufferId,
+    saved: &[BlockSaved],
+    d: BufferId,
+    inside: Inside,
+    d_x: Option<Into>,
+    started: &mut Started,
+) -> Result<(), PlanError> {
+    let mut d = d;
+    for (k, (block, block_saved)) in blocks.iter().zip(saved).enumerate().rev() {
+        let features = block.layer.out_features;
+        if let Some(affine) = block.affine {
+            let norm = NormSaved { x: block_saved.z, stats: block_saved.stats, affine };
+            if let Some(d_affine) = block.d_affine {
+                let accumulate = started.accumulate(d_affine, 0);
+                layer_norm_relu::backward_affine(b, rows.count(), features, norm, d, inside.partial, d_affine, accumulate)?;
+            }
+            layer_norm_relu::backward_input(b, rows.count(), features, norm, d, inside.d_z)?;
+            d = inside.d_z;
+        }
+        let input = if k == 0 { x } else { saved[k - 1].y };
+        weights(b, rows, block, input, d, inside.partial, started)?;
+        let into = if k == 0 { d_x } else { Some(Into { buffer: inside.d_y, accumulate: false }) };
+        if let Some(into) = into {
+            linear::backward_input(b, rows, block.layer, d, network.slots, into.buffer, into.accumulate)?;
+            d = into.buffer;
+        }
+    }
+    Ok(())
+}
+
+/// Gradient of a layer's weights, where it is wanted.
+fn weights(
+    b: &mut Builder,
+    rows: Rows,
+    block: &BlockBuffers,
+    x: BufferId,
+    d_y: BufferId,
+    partial: BufferId,
+    started: &mut Started,
+) -> Result<(), PlanError> {
+    let Some(d_weights) = block.d_weights else { return Ok(()) };
+    // Tiles of different images write different sets of per-instance weights.
+    let part = if matches!(block.layer.sets, linear::Sets::Shared) { 0 } else { rows.first_group };
+    let accumulate = started.accumulate(d_weights, part);
+    linear::backward_weight(b, rows, block.layer, x, d_y, partial, d_weights, accumulate)
+}
+
+/// From the gradients of f's weights to the hypernetwork's parameters and to `d_z` `[slots, latent]`, the codes of the batch.
+pub(crate) fn hypernetwork(
+    b: &mut Builder,
+    network: &Network,
+    saved: &HyperSaved,
+    scratch: &HyperScratch,
+    partial: BufferId,
+    started: &mut Started,
+) -> Result<(), PlanError> {
+    let rows = Rows::plain(network.batch.slots);
+    let inside = Inside { d_y: scratch.d_y, d_z: scratch.d_hidden, partial };
+    for ((blocks, saved_blocks), scene) in network.hyper.iter().zip(&saved.mlps).zip(&network.scene) {
+        let Some(d_weights) = scene.d_weights else { continue };
+        let into = Into { buffer: scratch.d_z, accumulate: started.accumulate(scratch.d_z, 0) };
+        mlp(b, network, rows, blocks, saved.z, saved_blocks, d_weights, inside, Some(into), started)?;
+    }
+    Ok(())
+}
+
+/// Gradient of the codes in the batch to the table of codes.
+pub(crate) fn codes(b: &mut Builder, network: &Network, d_z: BufferId) -> Result<(), PlanError> {
+    match network.d_parameters[0] {
+        Some(d_codes) => embedding::backward(b, network.embedding(), network.index, d_z, d_codes),
+        None => Ok(()),
+    }
+}
+
+/// Scratch of the hypernetwork's backward pass.
+#[derive(Debug)]
+pub(crate) struct HyperScratch {
+    pub d_y: BufferId,
+    pub d_hidden: BufferId,
+    /// Gradient of the codes in the batch `[slots, latent]`.
+    pub d_z: BufferId,
+}
+
+impl HyperScratch {
+    pub fn new(b: &mut Builder, network: &Network) -> Result<Self, PlanError> {
+        let hidden = network.hyper.iter().flatten().filter(|block| block.affine.is_some()).map(|block| block.layer.out_features);
+        let len = (network.batch.slots * hidden.max().unwrap_or(1)) as usize;
+        let d_z = b.scratch("d z of slots", (network.batch.slots * network.latent) as usize)?;
+        Ok(HyperScratch { d_y: b.scratch("d y of hyper", len)?, d_hidden: b.scratch("d z of hyper", len)?, d_z })
+    }
+}

@@ -1,0 +1,88 @@
+//! Forward pass (spec 2).
+
+use srn_plan::ops::embedding::Embedding;
+use srn_plan::ops::layer_norm_relu::Saved as NormSaved;
+use srn_plan::ops::rays::Pixels;
+use srn_plan::ops::{advance, density_sum, depth, embedding, layer_norm_relu, linear, lstm_cell, rays, tile as tile_ops};
+use srn_plan::{BufferId, Builder, PlanError, Rows, Tile};
+
+use super::{BlockBuffers, BlockSaved, HyperSaved, Network, Saved};
+
+/// Codes of the slots, then one MLP per layer of f: code to weights.
+pub(crate) fn hypernetwork(b: &mut Builder, network: &Network, saved: &HyperSaved) -> Result<(), PlanError> {
+    embedding::forward(b, network.embedding(), network.codes(), network.index, saved.z)?;
+    for (blocks, saved_blocks) in network.hyper.iter().zip(&saved.mlps) {
+        mlp(b, Rows::plain(network.batch.slots), blocks, saved.z, network.index, saved_blocks)?;
+    }
+    Ok(())
+}
+
+/// One tile of rays to colours and depths, `rgb` and `depth` of the batch.
+pub(crate) fn render(b: &mut Builder, network: &Network, saved: &Saved, tile: Tile) -> Result<(), PlanError> {
+    let rows = tile.rows;
+    let n = rows.count();
+    let (features, lstm) = (network.features(), network.lstm_size());
+    let last = network.tracing_steps as usize;
+
+    tile_ops::gather(b, tile, 2, network.uv, saved.uv)?;
+    tile_ops::gather(b, tile, 1, network.z0, saved.z0)?;
+    rays::forward(b, rows, network.pixels(saved), saved.x[0], saved.direction)?;
+    for i in 0..=last {
+        // v_i = f(x_i)
+        let v = mlp(b, rows, &network.scene, saved.x[i], network.slots, &saved.scene[i])?;
+        // phi = Σ g(x_i) f(x_i)
+        if let Some(density) = &network.density {
+            let g = mlp(b, rows, density, saved.x[i], network.slots, &saved.density[i])?;
+            density_sum::forward(b, n, features, g, v, saved.phi, i > 0)?;
+        }
+        if i == last {
+            break;
+        }
+        // (h, c) = lstm(v_i, (h, c)); x_{i+1} = x_i + d (w·h + b)
+        linear::forward(b, rows, network.lstm_input.layer, v, network.slots, saved.gates[i], false)?;
+        linear::forward(b, rows, network.lstm_hidden.layer, saved.h[i], network.slots, saved.gates[i], true)?;
+        lstm_cell::forward(b, n, lstm, saved.gates[i], saved.c[i], saved.h[i + 1], saved.c[i + 1])?;
+        linear::forward(b, rows, network.step_head.layer, saved.h[i + 1], network.slots, saved.step[i], false)?;
+        advance::forward(b, n, saved.x[i], saved.direction, saved.step[i], saved.x[i + 1])?;
+    }
+    // rgb = h(phi); depth = z of x_M
+    let rgb = mlp(b, rows, &network.pixel_generator, saved.phi, network.slots, &saved.pixel_generator)?;
+    tile_ops::scatter(b, tile, 3, rgb, network.rgb)?;
+    depth::forward(b, rows, network.world_from_camera, saved.x[last], saved.depth)?;
+    tile_ops::scatter(b, tile, 1, saved.depth, network.depth)
+}
+
+/// Layers one after the other; returns the buffer of the last output.
+fn mlp(
+    b: &mut Builder,
+    rows: Rows,
+    blocks: &[BlockBuffers],
+    x: BufferId,
+    slots: BufferId,
+    saved: &[BlockSaved],
+) -> Result<BufferId, PlanError> {
+    let mut x = x;
+    for (block, saved) in blocks.iter().zip(saved) {
+        linear::forward(b, rows, block.layer, x, slots, saved.z, false)?;
+        if let Some(affine) = block.affine {
+            let norm = NormSaved { x: saved.z, stats: saved.stats, affine };
+            layer_norm_relu::forward(b, rows.count(), block.layer.out_features, norm, saved.y)?;
+        }
+        x = saved.y;
+    }
+    Ok(x)
+}
+
+impl Network {
+    pub(super) fn embedding(&self) -> Embedding {
+        Embedding { batch: self.batch.slots, instances: self.instances, latent: self.latent }
+    }
+
+    pub(super) fn codes(&self) -> BufferId {
+        self.parameters[0]
+    }
+
+    pub(crate) fn pixels(&self, saved: &Saved) -> Pixels {
+        Pixels { world_from_camera: self.world_from_camera, intrinsics: self.intrinsics, uv: saved.uv, z0: saved.z0 }
+    }
+}

@@ -1,0 +1,208 @@
+//! The network as steps of a plan, in the paper's order: hypernetwork (codes to the weights of f), rays, scene MLP f, LSTM ray
+//! marcher, density net g, density-weighted sum, pixel generator h. [`forward`] and [`backward`] mirror each other.
+
+pub(crate) mod backward;
+pub(crate) mod forward;
+mod saved;
+
+use std::collections::HashSet;
+
+use srn_plan::ops::linear::{Layer, Sets};
+use srn_plan::{BufferId, Builder, PlanError};
+
+pub(crate) use saved::{BlockSaved, HyperSaved, Saved, Scratch};
+
+use crate::model::{Block, Model};
+
+/// What the renderer will be used for; decides what the forward pass keeps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Purpose {
+    /// Images only: nothing is kept.
+    Render,
+    /// Gradients to the rays.
+    Pose,
+    /// Gradients to the rays and to the weights.
+    Train,
+}
+
+/// Sizes of a batch of images.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Batch {
+    /// Images (hypotheses, when poses are estimated).
+    pub images: u32,
+    /// Rays of each.
+    pub rays: u32,
+    /// Sets of weights of f: one per image in training, one per instance otherwise.
+    pub slots: u32,
+}
+
+/// A layer with its buffers.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct BlockBuffers {
+    pub layer: Layer,
+    /// Gamma and beta; `None` for a layer without norm and ReLU.
+    pub affine: Option<BufferId>,
+    /// Gradient of the weights, if wanted.
+    pub d_weights: Option<BufferId>,
+    /// Gradient of gamma and beta, if wanted.
+    pub d_affine: Option<BufferId>,
+}
+
+/// The model's parameters, and what is shared by the whole batch, as buffers of a plan.
+#[derive(Debug)]
+pub(crate) struct Network {
+    pub batch: Batch,
+    pub tracing_steps: u32,
+    pub latent: u32,
+    pub instances: u32,
+    /// One buffer per parameter of the model, in its order.
+    pub parameters: Vec<BufferId>,
+    /// Gradients of the parameters that are trained.
+    pub d_parameters: Vec<Option<BufferId>>,
+    /// Number of the instance behind each slot `[slots]`.
+    pub index: BufferId,
+    /// Slot of each image `[images]`.
+    pub slots: BufferId,
+    /// `world_from_camera [images,12]`, `intrinsics [images,4]`, `uv [images·rays,2]`, `z0 [images·rays]`.
+    pub world_from_camera: BufferId,
+    pub intrinsics: BufferId,
+    pub uv: BufferId,
+    pub z0: BufferId,
+    /// Results `[images·rays,3]` and `[images·rays]`.
+    pub rgb: BufferId,
+    pub depth: BufferId,
+    pub hyper: Vec<Vec<BlockBuffers>>,
+    pub scene: Vec<BlockBuffers>,
+    pub lstm_input: BlockBuffers,
+    pub lstm_hidden: BlockBuffers,
+    pub step_head: BlockBuffers,
+    pub density: Option<Vec<BlockBuffers>>,
+    pub pixel_generator: Vec<BlockBuffers>,
+    /// Gamma = 1, beta = 0 for each width of f: its layer norm has no affine part.
+    pub identity: Vec<(BufferId, u32)>,
+}
+
+/// Which parameters get gradients.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Trainable {
+    Nothing,
+    Codes,
+    Everything,
+}
+
+impl Network {
+    /// Adds the buffers. `world_from_camera` is a step's output when poses are estimated, else the caller's input.
+    pub fn new(b: &mut Builder, model: &Model, batch: Batch, trainable: Trainable, pose_is_input: bool) -> Result<Self, PlanError> {
+        let layout = &model.layout;
+        let mut parameters = Vec::new();
+        let mut d_parameters = Vec::new();
+        for (number, parameter) in model.parameters.iter().enumerate() {
+            let (name, len) = (&parameter.tensors[0].0, parameter.values.len());
+            parameters.push(b.input(name.clone(), len)?);
+            let wanted = match trainable {
+                Trainable::Nothing => false,
+                Trainable::Codes => number == layout.codes,
+                Trainable::Everything => true,
+            };
+            d_parameters.push(if wanted { Some(b.scratch(format!("d {name}"), len)?) } else { None });
+        }
+        let block = |block: &Block| BlockBuffers {
+            layer: Layer {
+                weights: parameters[block.linear],
+                in_features: block.in_features,
+                out_features: block.out_features,
+                sets: Sets::Shared,
+            },
+            affine: block.affine.map(|affine| parameters[affine]),
+            d_weights: d_parameters[block.linear],
+            d_affine: block.affine.and_then(|affine| d_parameters[affine]),
+        };
+        let blocks = |list: &Vec<Block>| list.iter().map(block).collect::<Vec<_>>();
+
+        let mut identity: Vec<(BufferId, u32)> = Vec::new();
+        let mut scene = Vec::new();
+        for (number, &(in_features, out_features)) in layout.scene.iter().enumerate() {
+            if !identity.iter().any(|known| known.1 == out_features) {
+                identity.push((b.input(format!("identity affine {out_features}"), 2 * out_features as usize)?, out_features));
+            }
+            let len = batch.slots as usize * (out_features * (in_features + 1)) as usize;
+            let weights = b.scratch(format!("f.{number} weights"), len)?;
+            let d_weights =
+                if trainable == Trainable::Nothing { None } else { Some(b.scratch(format!("d f.{number} weights"), len)?) };
+            scene.push(BlockBuffers {
+                layer: Layer { weights, in_features, out_features, sets: Sets::Slots { count: batch.slots } },
+                affine: identity.iter().find(|known| known.1 == out_features).map(|known| known.0),
+                d_weights,
+                d_affine: None,
+            });
+        }
+
+        let images = batch.images as usize;
+        let rows = images * batch.rays as usize;
+        Ok(Network {
+            batch,
+            tracing_steps: layout.tracing_steps,
+            latent: layout.latent,
+            instances: layout.instances,
+            index: b.input_u32("instance of slot", batch.slots as usize)?,
+            slots: b.input_u32("slot of image", images)?,
+            world_from_camera: if pose_is_input {
+                b.input("world_from_camera", 12 * images)?
+            } else {
+                b.scratch("world_from_camera", 12 * images)?
+            },
+            intrinsics: b.input("intrinsics", 4 * images)?,
+            uv: b.input("uv", 2 * rows)?,
+            z0: b.input("z0", rows)?,
+            rgb: b.scratch("rgb", 3 * rows)?,
+            depth: b.scratch("depth", rows)?,
+            hyper: layout.hyper.iter().map(blocks).collect(),
+            scene,
+            lstm_input: block(&layout.lstm_input),
+            lstm_hidden: block(&layout.lstm_hidden),
+            step_head: block(&layout.step_head),
+            density: layout.density.as_ref().map(blocks),
+            pixel_generator: blocks(&layout.pixel_generator),
+            parameters,
+            d_parameters,
+            identity,
+        })
+    }
+
+    /// Features of f.
+    pub fn features(&self) -> u32 {
+        self.scene.last().map_or(0, |block| block.layer.out_features)
+    }
+
+    /// Size of the LSTM's hidden state.
+    pub fn lstm_size(&self) -> u32 {
+        self.lstm_hidden.layer.in_features
+    }
+
+    /// Writes the parameters and constants into an executor.
+    pub fn upload(&self, executor: &mut dyn srn_plan::Executor, model: &Model) -> Result<(), srn_plan::ExecutorError> {
+        for (&buffer, parameter) in self.parameters.iter().zip(&model.parameters) {
+            executor.write(buffer, &parameter.values)?;
+        }
+        for &(buffer, width) in &self.identity {
+            executor.write(buffer, &[vec![1.0; width as usize], vec![0.0; width as usize]].concat())?;
+        }
+        Ok(())
+    }
+}
+
+/// Gradients that have been written already: the first contribution overwrites, the next ones accumulate.
+#[derive(Debug, Default)]
+pub(crate) struct Started(HashSet<(BufferId, u32)>);
+
+impl Started {
+    /// Whether to accumulate into `buffer`; `part` tells apart the parts of a buffer that tiles write separately.
+    pub fn accumulate(&mut self, buffer: BufferId, part: u32) -> bool {
+        !self.0.insert((buffer, part))
+    }
+
+    /// Makes the next contribution to `buffer` the first one again.
+    pub fn restart(&mut self, buffer: BufferId, part: u32) {
+        self.0.remove(&(buffer, part));
+    }
+}

@@ -1,0 +1,150 @@
+//! Novel views: rgb and depth of instances from given cameras.
+
+use glam::DMat4;
+use srn_plan::ops::pack_rgba8;
+use srn_plan::{BufferId, Builder, Plan, PlanError, StageId, tiles};
+
+use crate::camera::Intrinsics;
+use crate::engine::{Engine, Runner};
+use crate::model::Model;
+use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Trainable, forward};
+use crate::random::stream;
+use crate::{Error, Rays, pixel_grid};
+
+/// Rendered images.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rendering {
+    /// Colours `[views, height, width, 3]`, about -1 to 1, not clamped.
+    pub rgb: Vec<f32>,
+    /// Depth of each ray's end point, z in its camera's frame, object units, `[views, height, width]`.
+    pub depth: Vec<f32>,
+}
+
+struct Handles {
+    network: Network,
+    packed: BufferId,
+    instances: StageId,
+    render: StageId,
+    pack: StageId,
+}
+
+/// Renders a fixed number of views at a time, of a fixed size.
+///
+/// On a GPU, [`Renderer::encode`] and [`Renderer::encode_to_texture`] work on the caller's device inside the caller's frame.
+pub struct Renderer {
+    runner: Runner,
+    handles: Handles,
+    width: u32,
+    height: u32,
+    views: u32,
+    instances: Option<Vec<u32>>,
+}
+
+impl Renderer {
+    /// A renderer of `views` images of `width` × `height` pixels.
+    pub fn new(engine: &Engine, model: &Model, views: u32, width: u32, height: u32) -> Result<Self, Error> {
+        for (field, value) in [("views", views), ("width", width), ("height", height)] {
+            if value == 0 {
+                return Err(Error::Setting { field, what: "must be at least 1".into() });
+            }
+        }
+        let rays = width * height;
+        let (plan, handles) =
+            engine.fit(views * rays, |tile_rows| build(engine.builder(), model, views, [width, height], tile_rows))?;
+        let mut runner = engine.prepare(plan)?;
+        handles.network.upload(&mut *runner, model)?;
+        let slots: Vec<u32> = (0..views).collect();
+        runner.write_u32(handles.network.slots, &slots)?;
+        Ok(Renderer { runner, handles, width, height, views, instances: None })
+    }
+
+    /// Renders view `k` of instance `instances[k]` from `cameras[k]`: `world_from_camera` and intrinsics. `seed` draws the
+    /// initial depths (spec 2).
+    pub fn render(&mut self, instances: &[u32], cameras: &[(DMat4, Intrinsics)], seed: u64) -> Result<Rendering, Error> {
+        self.set_views(instances, cameras, seed)?;
+        self.runner.run(self.handles.render)?;
+        let rgb = self.runner.read(self.handles.network.rgb)?;
+        Ok(Rendering { rgb, depth: self.runner.read(self.handles.network.depth)? })
+    }
+
+    /// Sets what [`Renderer::encode`] renders.
+    pub fn set_views(&mut self, instances: &[u32], cameras: &[(DMat4, Intrinsics)], seed: u64) -> Result<(), Error> {
+        let network = &self.handles.network;
+        for (input, got) in [("instances", instances.len()), ("cameras", cameras.len())] {
+            if got != self.views as usize {
+                let what = format!("got {got}, this renderer makes {} views", self.views);
+                return Err(Error::Input { input: input.into(), what });
+            }
+        }
+        if let Some(instance) = instances.iter().find(|&&instance| instance >= network.instances) {
+            let what = format!("number {instance}, but the model has {}", network.instances);
+            return Err(Error::Input { input: "instances".into(), what });
+        }
+        let mut random = stream(seed, 0);
+        let mut rays = Rays::default();
+        for (world_from_camera, intrinsics) in cameras {
+            rays.push(world_from_camera, intrinsics, pixel_grid(self.width, self.height, 1), &mut random);
+        }
+        self.runner.write_f64(network.world_from_camera, rays.world_from_camera.as_flattened())?;
+        rays.write(&mut *self.runner, network)?;
+        if self.instances.as_deref() != Some(instances) {
+            self.runner.write_u32(network.index, instances)?;
+            self.runner.run(self.handles.instances)?;
+            self.instances = Some(instances.to_vec());
+        }
+        Ok(())
+    }
+
+    /// Appends the rendering of the views set before to the caller's encoder; the results are in [`Renderer::rgb_buffer`] and
+    /// [`Renderer::depth_buffer`] once it ran. `None` on the CPU.
+    pub fn encode(&self, encoder: &mut wgpu::CommandEncoder) -> Option<()> {
+        self.runner.as_gpu()?.encode(self.handles.render, encoder);
+        Some(())
+    }
+
+    /// Like [`Renderer::encode`], then copies the first view to the top left corner of `texture`, an `Rgba8Unorm` or
+    /// `Rgba8UnormSrgb` texture with `COPY_DST`, of at least the size of a view. `None` on the CPU.
+    pub fn encode_to_texture(&self, encoder: &mut wgpu::CommandEncoder, texture: &wgpu::Texture) -> Option<()> {
+        let executor = self.runner.as_gpu()?;
+        executor.encode(self.handles.render, encoder);
+        executor.encode(self.handles.pack, encoder);
+        let layout = wgpu::TexelCopyBufferLayout {
+            offset: 0,
+            bytes_per_row: Some(4 * pack_rgba8::stride(self.width)),
+            rows_per_image: None,
+        };
+        let source = wgpu::TexelCopyBufferInfo { buffer: executor.buffer(self.handles.packed), layout };
+        let size = wgpu::Extent3d { width: self.width, height: self.height, depth_or_array_layers: 1 };
+        encoder.copy_buffer_to_texture(source, texture.as_image_copy(), size);
+        Some(())
+    }
+
+    /// The device buffer of the colours, `[views, height, width, 3]` as `f32`. `None` on the CPU.
+    pub fn rgb_buffer(&self) -> Option<&wgpu::Buffer> {
+        Some(self.runner.as_gpu()?.buffer(self.handles.network.rgb))
+    }
+
+    /// The device buffer of the depths, `[views, height, width]` as `f32`. `None` on the CPU.
+    pub fn depth_buffer(&self) -> Option<&wgpu::Buffer> {
+        Some(self.runner.as_gpu()?.buffer(self.handles.network.depth))
+    }
+}
+
+fn build(mut b: Builder, model: &Model, views: u32, [width, height]: [u32; 2], tile_rows: u32) -> Result<(Plan, Handles), PlanError> {
+    let rays = width * height;
+    let network = Network::new(&mut b, model, Batch { images: views, rays, slots: views }, Trainable::Nothing, true)?;
+    let cut = tiles(views, rays, tile_rows);
+    let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
+    let saved = Saved::new(&mut b, &network, Purpose::Render, most)?;
+    let hyper_saved = HyperSaved::new(&mut b, &network)?;
+    let packed = b.scratch_u32("packed rgba8", (pack_rgba8::stride(width) * height) as usize)?;
+    let instances = b.stage("instances");
+    forward::hypernetwork(&mut b, &network, &hyper_saved)?;
+    let render = b.stage("render");
+    for &tile in &cut {
+        forward::render(&mut b, &network, &saved, tile)?;
+    }
+    let pack = b.stage("pack");
+    pack_rgba8::forward(&mut b, width, height, 0, network.rgb, packed)?;
+    Ok((b.finish()?, Handles { network, packed, instances, render, pack }))
+}

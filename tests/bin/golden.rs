@@ -1,0 +1,59 @@
+//! `golden DIR`: every golden file of a folder on every executor; exit 1 where a figure exceeds its limit.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use sigma_srn::{Engine, Gpu};
+use srn_tests::golden::{Limits, check};
+
+fn main() -> ExitCode {
+    match run() {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(1),
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn run() -> Result<bool, String> {
+    let mut arguments = std::env::args().skip(1);
+    let folder = PathBuf::from(arguments.next().ok_or("usage: golden DIR [cpu64|cpu|gpu …]")?);
+    let wanted: Vec<String> = arguments.collect();
+    let mut engines = vec![("cpu64", Engine::cpu_f64(), Limits::F64), ("cpu", Engine::cpu(), Limits::F32)];
+    if wanted.is_empty() || wanted.iter().any(|name| name == "gpu") {
+        let gpu = Gpu::open(None).map_err(|error| error.to_string())?;
+        println!("adapter: {}", gpu.adapter().name);
+        engines.push(("gpu", Engine::gpu(gpu), Limits::F32));
+    }
+    engines.retain(|(name, ..)| wanted.is_empty() || wanted.iter().any(|wanted| wanted == name));
+    let entries = std::fs::read_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    let mut files: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
+    files.retain(|path| path.extension().is_some_and(|extension| extension == "safetensors"));
+    files.sort();
+    if files.is_empty() {
+        return Err(format!("{}: no .safetensors files", folder.display()));
+    }
+    println!("{:<14} {:<6} {:<20} {:>9} {:>9}  worst in", "file", "on", "quantity", "worst", "limit");
+    let mut all_pass = true;
+    for file in &files {
+        let name = file.file_stem().unwrap_or_default().to_string_lossy();
+        for (engine_name, engine, limits) in &engines {
+            for figure in check(engine, file, *limits)? {
+                let pass = figure.worst <= figure.limit;
+                all_pass &= pass;
+                println!(
+                    "{name:<14} {engine_name:<6} {:<20} {:>9.1e} {:>9.0e}  {}{}",
+                    figure.quantity,
+                    figure.worst,
+                    figure.limit,
+                    figure.tensor,
+                    if pass { "" } else { "  EXCEEDS ITS LIMIT" }
+                );
+            }
+        }
+    }
+    println!("{}", if all_pass { "every figure is within its limit" } else { "some figures exceed their limits" });
+    Ok(all_pass)
+}

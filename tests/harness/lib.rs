@@ -1,0 +1,13 @@
+//! This crate owns what tests share: the comparison of results, the device, plans with random inputs, and lockstep.
+//! It does not know single kernels, nor the model.
+
+pub mod golden;
+mod case;
+mod close;
+mod device;
+mod lockstep;
+
+pub use case::{Case, Sketch};
+pub use close::{assert_close, difference};
+pub use device::gpu;
+pub use lockstep::{Divergence, lockstep};
