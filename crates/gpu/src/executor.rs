@@ -11,7 +11,7 @@ pub(crate) struct Launch {
     pipeline: Arc<Pipeline>,
     bind_group: wgpu::BindGroup,
     grid: [u32; 3],
-    /// `op/variant`.
+    /// `op/variant`, also of the pipeline and the bind group.
     pub label: String,
 }
 
@@ -81,6 +81,11 @@ impl GpuExecutor {
     /// The device buffer behind an id of the plan: usages `STORAGE`, `COPY_SRC`, `COPY_DST`.
     pub fn buffer(&self, id: BufferId) -> &wgpu::Buffer {
         &self.buffers[id.index()]
+    }
+
+    /// The kernel variant that a step runs, as `op/variant`.
+    pub fn label(&self, stage: StageId, step: usize) -> &str {
+        &self.stages[stage.index()][step].label
     }
 
     /// Appends all steps of a stage to the caller's encoder, as one compute pass. Its errors appear where the caller

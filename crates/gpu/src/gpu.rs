@@ -18,7 +18,7 @@ pub struct AdapterInfo {
     /// The driver and its version.
     pub driver: String,
     /// True where the "GPU" is this machine's CPU (llvmpipe, WARP, SwiftShader).
-    pub software: bool,
+    pub is_software: bool,
 }
 
 impl From<wgpu::AdapterInfo> for AdapterInfo {
@@ -27,7 +27,7 @@ impl From<wgpu::AdapterInfo> for AdapterInfo {
             name: info.name,
             backend: format!("{:?}", info.backend),
             driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
-            software: info.device_type == wgpu::DeviceType::Cpu,
+            is_software: info.device_type == wgpu::DeviceType::Cpu,
         }
     }
 }
@@ -207,7 +207,10 @@ impl Gpu {
         let value = work();
         // Popped in reverse, all of them; natively the errors of a call are known when it returns.
         let errors: Vec<_> = scopes.into_iter().rev().filter_map(|scope| pollster::block_on(scope.pop())).collect();
-        // A lost device explains every other error.
+        // A lost device explains every other error, and tells it when polled.
+        if !errors.is_empty() {
+            let _ = self.poll(wgpu::PollType::Poll);
+        }
         let lost = lock(&self.shared.lost).clone();
         let error = lost.or_else(|| match errors.first() {
             Some(wgpu::Error::OutOfMemory { .. }) => Some("out of device memory; set a smaller memory budget".into()),
@@ -215,6 +218,14 @@ impl Gpu {
             None => lock(&self.shared.uncaptured).take(),
         });
         error.map_or(Ok(value), |error| Err(ExecutorError::Device { what: format!("{what}: {error}") }))
+    }
+
+    /// wgpu panics in `poll`, where it holds no lock, when the driver reports a lost device.
+    fn poll(&self, poll: wgpu::PollType) -> Result<(), String> {
+        match catch_unwind(AssertUnwindSafe(|| self.device.poll(poll))) {
+            Ok(status) => status.map(drop).map_err(|error| error.to_string()),
+            Err(_) => Err("the device was lost".into()),
+        }
     }
 
     /// Reads the first `bytes` of a buffer with usage `COPY_SRC`, after all work submitted before.
@@ -230,14 +241,9 @@ impl Gpu {
             });
             let mut encoder = self.device.create_command_encoder(&Default::default());
             encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
-            let submission_index = Some(self.queue.submit([encoder.finish()]));
+            self.queue.submit([encoder.finish()]);
             staging.slice(..).map_async(wgpu::MapMode::Read, move |result| drop(sender.send(result)));
-            // wgpu panics in `poll` when the driver reports a lost device; no lock is held there.
-            let wait = wgpu::PollType::Wait { submission_index, timeout: None };
-            catch_unwind(AssertUnwindSafe(|| self.device.poll(wait)))
-                .map_err(|_| "the device was lost".to_owned())
-                .and_then(|status| status.map_err(|error| error.to_string()))
-                .map(|_| staging)
+            self.poll(wgpu::PollType::wait_indefinitely()).map(|()| staging)
         })?;
         let staging = staging.map_err(failed)?;
         // Another thread's `poll` may be the one that calls back, after ours has returned: wait for it.

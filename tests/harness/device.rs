@@ -1,0 +1,18 @@
+use std::io::Write;
+use std::sync::OnceLock;
+
+use srn_gpu::Gpu;
+
+/// The device of this test process: the preferred adapter, or the one that the variable `SIGMA_SRN_ADAPTER` names.
+///
+/// Prints the adapter's name first. No adapter is a failure, not a reason to skip.
+pub fn gpu() -> &'static Gpu {
+    static GPU: OnceLock<Gpu> = OnceLock::new();
+    GPU.get_or_init(|| {
+        let wanted = std::env::var("SIGMA_SRN_ADAPTER").ok();
+        let gpu = Gpu::open(wanted.as_deref()).unwrap_or_else(|error| panic!("GPU tests need an adapter: {error}"));
+        // Not `eprintln`, which the test harness swallows where the test passes.
+        let _ = writeln!(std::io::stderr(), "adapter: {}", gpu.adapter());
+        gpu
+    })
+}

@@ -1,0 +1,85 @@
+use srn_plan::ops::layer_norm_relu::{self, Saved};
+use srn_shaders::{LAYER_NORM_RELU_BACKWARD_AFFINE, LAYER_NORM_RELU_BACKWARD_INPUT, LAYER_NORM_RELU_FORWARD};
+use srn_tests::{Case, Sketch};
+
+use crate::KernelTest;
+
+pub static FORWARD: KernelTest = KernelTest {
+    kernel: &LAYER_NORM_RELU_FORWARD,
+    // Worst 1.9e-7 on llvmpipe.
+    tolerance: 1e-6,
+    cases,
+    faults: &[
+        ("forward", "+ 1e-5", "+ 1e-2"),
+        ("forward", "affine[n + j]", "affine[j]"),
+        ("forward", "1.0 / sqrt", "sqrt"),
+        ("forward_vec4", "+ 1e-5", "+ 1e-2"),
+        ("forward_vec4", "params.features / 4u;", "params.features / 8u;"),
+        ("forward_vec4", "f32(params.features);", "f32(n);"),
+    ],
+};
+
+pub static BACKWARD_INPUT: KernelTest = KernelTest {
+    kernel: &LAYER_NORM_RELU_BACKWARD_INPUT,
+    // Worst 1.4e-7 on llvmpipe.
+    tolerance: 7e-7,
+    cases,
+    faults: &[
+        ("backward_input", "- mean_e", "+ mean_e"),
+        ("backward_input", "along += e * normalised", "along += e"),
+        ("backward_input", "> 0.0)", "< 0.0)"),
+        ("backward_input_vec4", "- mean_e", "+ mean_e"),
+        ("backward_input_vec4", "dot(along, vec4(1.0))", "dot(along, vec4(1.0, 1.0, 1.0, 0.0))"),
+        ("backward_input_vec4", "params.features / 4u + j", "params.features / 2u + j"),
+    ],
+};
+
+pub static BACKWARD_AFFINE: KernelTest = KernelTest {
+    kernel: &LAYER_NORM_RELU_BACKWARD_AFFINE,
+    // Worst 2.8e-7 on llvmpipe.
+    tolerance: 2e-6,
+    cases,
+    faults: &[
+        ("backward_affine", "d_gamma += e * normalised", "d_gamma += e"),
+        ("backward_affine", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
+        ("backward_affine", "> 0.0)", "> 1.0)"),
+    ],
+};
+
+#[test]
+fn forward_matches_reference() {
+    FORWARD.matches_reference();
+}
+
+#[test]
+fn backward_input_matches_reference() {
+    BACKWARD_INPUT.matches_reference();
+}
+
+#[test]
+fn backward_affine_matches_reference() {
+    BACKWARD_AFFINE.matches_reference();
+}
+
+fn cases() -> Vec<Case> {
+    [(1, 3, false), (7, 17, true), (129, 30, false), (300, 5, true), (1, 4, true), (129, 64, true), (300, 8, false)]
+        .map(|(rows, features, accumulate)| case(rows, features, accumulate))
+        .into()
+}
+
+/// Forward and both ways back: these need the statistics.
+fn case(rows: u32, features: u32, accumulate: bool) -> Case {
+    let mut s = Sketch::new(format!("{rows} rows of {features}, accumulate {accumulate}"));
+    let (n, width) = ((rows * features) as usize, features as usize);
+    let [x, d_y] = ["x", "d_y"].map(|name| s.random(name, n));
+    let affine = s.random("affine", 2 * width);
+    let stats = s.scratch("stats", 2 * rows as usize);
+    let [y, d_x] = ["y", "d_x"].map(|name| s.scratch(name, n));
+    let partial = s.scratch("partial", layer_norm_relu::partial_len(rows, features));
+    let d_affine = s.output("d_affine", 2 * width, accumulate);
+    let saved = Saved { x, stats, affine };
+    s.step(|b| layer_norm_relu::forward(b, rows, features, saved, y));
+    s.step(|b| layer_norm_relu::backward_input(b, rows, features, saved, d_y, d_x));
+    s.step(|b| layer_norm_relu::backward_affine(b, rows, features, saved, d_y, partial, d_affine, accumulate));
+    s.finish()
+}

@@ -1,0 +1,168 @@
+use srn_plan::Rows;
+use srn_plan::ops::linear::{self, Layer, Sets};
+use srn_shaders::{LINEAR_BACKWARD_INPUT, LINEAR_BACKWARD_WEIGHT, LINEAR_FORWARD};
+use srn_tests::{Case, Sketch};
+
+use crate::{KernelTest, ROWS};
+
+pub static FORWARD: KernelTest = KernelTest {
+    kernel: &LINEAR_FORWARD,
+    // Worst 2.5e-7 on llvmpipe.
+    tolerance: 2e-6,
+    cases: forward,
+    faults: &[
+        ("forward", "* params.weight_stride", "* 0u"),
+        ("forward", "slots[params.first_group + group]", "slots[group]"),
+        ("forward", "tile[r] + bias", "tile[r]"),
+        ("forward", "i + lane < vec4(n)", "i + lane <= vec4(n)"),
+        ("forward", "accumulate == 1u", "accumulate == 0u"),
+        ("forward", "min(params.out_features - out, 4u)", "min(params.out_features - out, 3u)"),
+        ("forward_vec4", "slots[params.first_group + group]", "slots[group]"),
+        ("forward_vec4", "columns[r] + b", "columns[r]"),
+        ("forward_vec4", "y_ab += wb * xa", "y_ab += wa * xa"),
+        ("forward_vec4", "row + 4u, out + 4u, y_bb", "row + 4u, out + 4u, y_ba"),
+        ("forward_vec4", "accumulate == 1u", "accumulate == 0u"),
+    ],
+};
+
+pub static BACKWARD_INPUT: KernelTest = KernelTest {
+    kernel: &LINEAR_BACKWARD_INPUT,
+    // Worst 1.9e-6 on llvmpipe.
+    tolerance: 1e-5,
+    cases: backward_input,
+    faults: &[
+        ("backward_input", "o = params.first_out", "o = 0u"),
+        ("backward_input", "o + lane < vec4(params.end_out)", "o + lane <= vec4(params.end_out)"),
+        ("backward_input", "* inside.w", "* inside.z"),
+        ("backward_input", "slots[params.first_group + group]", "slots[group]"),
+        ("backward_input", "accumulate == 1u", "accumulate == 0u"),
+        ("backward_input_vec4", "o = params.first_out", "o = 0u"),
+        ("backward_input_vec4", "x_ba += wa * yb", "x_ba += wb * yb"),
+        ("backward_input_vec4", "weights[at + 3u * stride]", "weights[at + 2u * stride]"),
+        ("backward_input_vec4", "accumulate == 1u", "accumulate == 0u"),
+    ],
+};
+
+pub static BACKWARD_WEIGHT: KernelTest = KernelTest {
+    kernel: &LINEAR_BACKWARD_WEIGHT,
+    // Worst 3.9e-7 on llvmpipe.
+    tolerance: 2e-6,
+    cases: backward_weight,
+    faults: &[
+        ("backward_weight", "r + lane < vec4(end)", "r + lane <= vec4(end)"),
+        ("backward_weight", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
+        ("backward_weight", "workgroup.z / params.chunks", "0u / params.chunks"),
+        ("backward_weight", "bias += ", "bias = "),
+        ("backward_weight", "accumulate == 1u", "accumulate == 0u"),
+        ("backward_weight_vec4", "r + lane < vec4(end)", "r + lane <= vec4(end)"),
+        ("backward_weight_vec4", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
+        ("backward_weight_vec4", "w_ba += xa * transpose(yb)", "w_ba += xa * transpose(ya)"),
+        ("backward_weight_vec4", "bias_b += yb", "bias_b += ya"),
+        ("backward_weight_vec4", "accumulate == 1u", "accumulate == 0u"),
+    ],
+};
+
+#[test]
+fn forward_matches_reference() {
+    FORWARD.matches_reference();
+}
+
+#[test]
+fn backward_input_matches_reference() {
+    BACKWARD_INPUT.matches_reference();
+}
+
+#[test]
+fn backward_weight_matches_reference() {
+    BACKWARD_WEIGHT.matches_reference();
+}
+
+/// Sizes of a step.
+#[derive(Clone, Copy, Debug)]
+struct Size {
+    rows: Rows,
+    in_features: u32,
+    out_features: u32,
+    /// Sets of weights; 0: one that all groups share.
+    sets: u32,
+    accumulate: bool,
+}
+
+/// Widths that are multiples of four, for the vectorised variants, and widths that are not; wide and narrow.
+const WIDTHS: [(u32, u32); 8] = [(1, 1), (3, 17), (30, 64), (17, 3), (4, 4), (64, 12), (8, 64), (68, 132)];
+
+/// All rows and widths at least once, not all their combinations; both kinds of weights, both kinds of output.
+fn sizes() -> impl Iterator<Item = Size> {
+    (0..2 * WIDTHS.len()).map(|k| {
+        let (in_features, out_features) = WIDTHS[k % WIDTHS.len()];
+        // Rows, sets and accumulation repeat after 5, 3 and 2: coprime, so they meet in all ways.
+        let rows = ROWS[k % ROWS.len()];
+        Size { rows, in_features, out_features, sets: if k % 3 == 0 { 0 } else { 4 }, accumulate: k % 2 == 1 }
+    })
+}
+
+fn layer(s: &mut Sketch, size: Size) -> Layer {
+    let Size { in_features, out_features, .. } = size;
+    let sets = if size.sets == 0 { Sets::Shared } else { Sets::Slots { count: size.sets } };
+    let weights = s.random("weights", (size.sets.max(1) * (in_features + 1) * out_features) as usize);
+    Layer { weights, in_features, out_features, sets }
+}
+
+fn forward() -> Vec<Case> {
+    sizes().map(forward_case).collect()
+}
+
+fn forward_case(size: Size) -> Case {
+    let mut s = Sketch::new(format!("{size:?}"));
+    let Size { rows, accumulate, .. } = size;
+    let layer = layer(&mut s, size);
+    let x = s.random("x", (rows.count() * size.in_features) as usize);
+    let slots = s.indices("slots", (rows.first_group + rows.groups) as usize, size.sets.max(1));
+    let y = s.output("y", (rows.count() * size.out_features) as usize, accumulate);
+    s.step(|b| linear::forward(b, rows, layer, x, slots, y, accumulate));
+    s.finish()
+}
+
+/// The last two sum so many outputs that they take two dispatches.
+fn backward_input() -> Vec<Case> {
+    let rows = Rows { groups: 1, rows_per_group: 3, first_group: 0 };
+    let wide = |in_features, out_features| Size { rows, in_features, out_features, sets: 1, accumulate: false };
+    sizes().chain([wide(3, 16_390), wide(4, 16_392)]).map(backward_input_case).collect()
+}
+
+fn backward_input_case(size: Size) -> Case {
+    let mut s = Sketch::new(format!("{size:?}"));
+    let Size { rows, accumulate, .. } = size;
+    let layer = layer(&mut s, size);
+    let d_y = s.random("d_y", (rows.count() * size.out_features) as usize);
+    let slots = s.indices("slots", (rows.first_group + rows.groups) as usize, size.sets.max(1));
+    let d_x = s.output("d_x", (rows.count() * size.in_features) as usize, accumulate);
+    s.step(|b| linear::backward_input(b, rows, layer, d_y, slots, d_x, accumulate));
+    s.finish()
+}
+
+/// The last ones have so many rows that they are summed in chunks.
+fn backward_weight() -> Vec<Case> {
+    let rows = Rows { groups: 2, rows_per_group: 1030, first_group: 1 };
+    let long = |in_features, out_features| Size { rows, in_features, out_features, sets: 4, accumulate: true };
+    sizes().chain([long(5, 3), long(4, 8)]).map(backward_weight_case).collect()
+}
+
+/// Weights of later images than the first are sums: those of earlier images stay.
+fn backward_weight_case(size: Size) -> Case {
+    let mut s = Sketch::new(format!("{size:?}"));
+    let Size { rows, in_features, out_features, accumulate, .. } = size;
+    let sets = if size.sets == 0 { Sets::Shared } else { Sets::Slots { count: rows.first_group + rows.groups } };
+    let x = s.random("x", (rows.count() * in_features) as usize);
+    let d_y = s.random("d_y", (rows.count() * out_features) as usize);
+    // The weights themselves take no part.
+    let layer = Layer { weights: x, in_features, out_features, sets };
+    let parameters = layer.parameters() as usize;
+    let (written, kept) = if size.sets == 0 { (1, 0) } else { (rows.groups as usize, rows.first_group as usize) };
+    let accumulate = accumulate || kept > 0;
+    let d_weights = s.output("d_weights", (kept + written) * parameters, accumulate);
+    let direct = kept == 0 && linear::partial_len(rows, layer) == written * parameters;
+    let partial = if direct { d_weights } else { s.scratch("partial", linear::partial_len(rows, layer)) };
+    s.step(|b| linear::backward_weight(b, rows, layer, x, d_y, partial, d_weights, accumulate));
+    s.finish()
+}

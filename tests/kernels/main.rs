@@ -1,0 +1,195 @@
+//! Every WGSL kernel against its CPU reference in `f64`, and every kernel with a fault planted into it.
+//!
+//! `<op>.rs` holds a [`KernelTest`] and a test for each direction of an op. Sizes are odd, groups several, outputs poisoned.
+
+use srn_cpu::CpuExecutor;
+use srn_gpu::{Gpu, GpuExecutor};
+use srn_plan::{ExecutorError, Kernel, Rows};
+use srn_shaders::TABLE;
+use srn_tests::{Case, Divergence, gpu, lockstep};
+
+mod adam;
+mod advance;
+mod density_sum;
+mod depth;
+mod depth_loss;
+mod embedding;
+mod executor;
+mod gmsd;
+mod image_loss;
+mod keep_best;
+mod latent_loss;
+mod layer_norm_relu;
+mod linear;
+mod lockstep;
+mod lstm_cell;
+mod pack_rgba8;
+mod pose;
+mod rays;
+mod sum;
+mod tile;
+
+/// What a kernel is tried on, how close it must come, and what must make it fail.
+struct KernelTest {
+    kernel: &'static Kernel,
+    /// Most difference, relative to the largest value of the output: the worst that was measured, which stands beside it,
+    /// times five.
+    tolerance: f64,
+    cases: fn() -> Vec<Case>,
+    /// Each of them some case must catch.
+    faults: &'static [Fault],
+}
+
+/// `(variant, from, to)`: a change to the WGSL text.
+type Fault = (&'static str, &'static str, &'static str);
+
+/// One of each kernel, in the order of the table.
+static ALL: &[&KernelTest] = &[
+    &pose::FORWARD,
+    &pose::BACKWARD,
+    &rays::FORWARD,
+    &rays::BACKWARD,
+    &tile::GATHER,
+    &tile::SCATTER,
+    &embedding::FORWARD,
+    &embedding::BACKWARD,
+    &linear::FORWARD,
+    &linear::BACKWARD_INPUT,
+    &linear::BACKWARD_WEIGHT,
+    &layer_norm_relu::FORWARD,
+    &layer_norm_relu::BACKWARD_INPUT,
+    &layer_norm_relu::BACKWARD_AFFINE,
+    &lstm_cell::FORWARD,
+    &lstm_cell::BACKWARD,
+    &advance::FORWARD,
+    &advance::BACKWARD,
+    &density_sum::FORWARD,
+    &density_sum::BACKWARD,
+    &depth::FORWARD,
+    &depth::BACKWARD,
+    &depth_loss::FORWARD,
+    &latent_loss::FORWARD,
+    &latent_loss::BACKWARD,
+    &image_loss::COUNT,
+    &image_loss::FORWARD,
+    &image_loss::BACKWARD,
+    &gmsd::POOL,
+    &gmsd::SIMILARITY,
+    &gmsd::MOMENTS,
+    &gmsd::DEVIATION,
+    &gmsd::BACKWARD_SIMILARITY,
+    &gmsd::BACKWARD_POOL,
+    &adam::STEP,
+    &sum::FORWARD,
+    &keep_best::STEP,
+    &pack_rgba8::FORWARD,
+];
+
+/// Rows of one image and of several, below and above a workgroup, starting at image 0 and later.
+const ROWS: [Rows; 5] = [
+    Rows { groups: 1, rows_per_group: 1, first_group: 0 },
+    Rows { groups: 1, rows_per_group: 7, first_group: 1 },
+    Rows { groups: 3, rows_per_group: 33, first_group: 2 },
+    Rows { groups: 1, rows_per_group: 129, first_group: 0 },
+    Rows { groups: 2, rows_per_group: 300, first_group: 0 },
+];
+
+impl KernelTest {
+    /// Runs every case; only the steps of this kernel run on the device, on inputs that the reference computed.
+    fn matches_reference(&self) {
+        let mut worst = 0.0f64;
+        let mut labels = Vec::new();
+        for case in (self.cases)() {
+            let executor =
+                GpuExecutor::new(gpu(), case.plan.clone(), u64::MAX).unwrap_or_else(|error| panic!("{}: {error}", case.name));
+            let steps = case.plan.stage(case.stage).steps.iter().enumerate();
+            let steps = steps.filter(|(_, step)| step.kernel.name == self.kernel.name);
+            labels.extend(steps.map(|(index, _)| executor.label(case.stage, index).to_owned()));
+            worst = worst.max(self.worst(&case, executor).unwrap_or_else(|what| panic!("{}: {what}", case.name)));
+        }
+        println!("worst {worst:.1e}: {}", self.kernel.name);
+        for variant in self.kernel.variants {
+            assert!(labels.contains(&format!("{}/{}", self.kernel.op, variant.name)), "no case runs {}", variant.name);
+        }
+    }
+
+    fn worst(&self, case: &Case, mut executor: GpuExecutor) -> Result<f64, Divergence> {
+        let mut reference = CpuExecutor::<f64>::new(case.plan.clone(), u64::MAX).expect("every kernel has a reference");
+        case.fill(&mut reference).expect("filling the reference");
+        case.fill(&mut executor).expect("filling the device");
+        let tolerance = |kernel: &Kernel| (kernel.name == self.kernel.name).then_some(self.tolerance);
+        let worst = lockstep(&mut executor, &mut reference, case.stage, tolerance)?;
+        Ok(worst[self.kernel.name])
+    }
+
+    /// The device, with a fault planted into this kernel.
+    fn faulty_gpu(&self, &(name, from, to): &Fault) -> Gpu {
+        let op = self.kernel.op;
+        gpu().with_sources(move |kernel, variant| {
+            let text = kernel.source(variant);
+            if (kernel.op, variant.name) == (op, name) { plant(&text, from, to) } else { text }
+        })
+    }
+
+    /// Whether some case fails with the fault planted.
+    fn catches(&self, fault: &Fault) -> Result<bool, ExecutorError> {
+        let gpu = self.faulty_gpu(fault);
+        for case in (self.cases)() {
+            if self.worst(&case, GpuExecutor::new(&gpu, case.plan.clone(), u64::MAX)?).is_err() {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+}
+
+/// Changes the first line of code that contains `from`.
+fn plant(text: &str, from: &str, to: &str) -> String {
+    let mut planted = false;
+    let lines = text.lines().map(|line| {
+        if planted || line.trim_start().starts_with("//") || !line.contains(from) {
+            return line.to_owned();
+        }
+        planted = true;
+        line.replacen(from, to, 1)
+    });
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+#[test]
+fn every_kernel_has_a_test_and_every_variant_a_planted_fault() {
+    let tested: Vec<_> = ALL.iter().map(|test| test.kernel.name).collect();
+    let table: Vec<_> = TABLE.iter().map(|kernel| kernel.name).collect();
+    assert_eq!(tested, table);
+    for test in ALL {
+        for variant in test.kernel.variants {
+            let source = test.kernel.source(variant);
+            let faults: Vec<_> = test.faults.iter().filter(|fault| fault.0 == variant.name).collect();
+            assert!(!faults.is_empty(), "{}/{} has no fault", test.kernel.op, variant.name);
+            for (_, from, to) in faults {
+                assert_ne!(plant(&source, from, to), source.trim_end(), "{}/{}: no `{from}`", test.kernel.op, variant.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn planted_fault() {
+    let faults: Vec<_> = ALL.iter().flat_map(|test| test.faults.iter().map(move |fault| (*test, fault))).collect();
+    let missed = |&(test, fault): &(&KernelTest, &Fault)| {
+        let (variant, from, to) = fault;
+        let what = match test.catches(fault) {
+            Ok(true) => return None,
+            Ok(false) => "is not caught".to_owned(),
+            Err(error) => error.to_string(),
+        };
+        Some(format!("{}/{variant}: `{from}` → `{to}` {what}", test.kernel.op))
+    };
+    // Compiling a kernel, most of the work here, does not use all cores.
+    let missed: Vec<String> = std::thread::scope(|scope| {
+        let parts = faults.chunks(faults.len().div_ceil(4));
+        let workers: Vec<_> = parts.map(|part| scope.spawn(move || part.iter().filter_map(missed).collect::<Vec<_>>())).collect();
+        workers.into_iter().flat_map(|worker| worker.join().expect("a worker panicked")).collect()
+    });
+    assert!(missed.is_empty(), "{}", missed.join("\n"));
+}
