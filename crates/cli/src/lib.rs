@@ -1,1 +1,3 @@
-//! placeholder
+//! This crate owns the command lines: flags, progress, reports and exit codes. It does not know the network or the file formats.
+
+pub mod common;

@@ -1,0 +1,153 @@
+//! What the binaries share: choice of the executor, exit codes, data sets as the network takes them, progress.
+
+use std::error::Error;
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::{Args, ValueEnum};
+use glam::DMat4;
+use indicatif::{ProgressBar, ProgressStyle};
+use sigma_srn::{Engine, Gpu, Intrinsics};
+use srn_data::{Dataset, LoadedView, SrnSet};
+use tracing_subscriber::filter::{LevelFilter, Targets};
+use tracing_subscriber::prelude::*;
+
+/// Results of the binaries: an error is one line for the user.
+pub type Result<T> = std::result::Result<T, Box<dyn Error + Send + Sync>>;
+
+/// Flags that choose what computes, and how much it says.
+#[derive(Args, Clone, Debug)]
+pub struct EngineArgs {
+    /// What computes. `auto`: a GPU if there is one, else the faster of CPU and software adapter.
+    #[arg(long, value_enum, default_value_t = Executor::Auto)]
+    executor: Executor,
+    /// Name, or part of it, of the graphics adapter; implies `--executor gpu`.
+    #[arg(long, value_name = "NAME")]
+    adapter: Option<String>,
+    /// Memory budget, as bytes or with a unit: 512MiB, 2GB. Default: from the adapter, 2 GiB on the CPU.
+    #[arg(long, value_name = "SIZE", value_parser = memory)]
+    memory: Option<u64>,
+    /// Say more on stderr.
+    #[arg(short, long)]
+    verbose: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Executor {
+    Auto,
+    Gpu,
+    Cpu,
+}
+
+impl EngineArgs {
+    /// Opens the executor, and says on stderr which it is and why.
+    pub fn open(&self) -> Result<Engine> {
+        log(self.verbose);
+        let (engine, reason) = match (self.executor, &self.adapter) {
+            (Executor::Cpu, Some(_)) => return Err("--adapter chooses a GPU, --executor cpu does without".into()),
+            (Executor::Cpu, None) => (Engine::cpu(), "CPU executor, as asked".into()),
+            (Executor::Auto, None) => Engine::automatic(),
+            (_, adapter) => {
+                let gpu = Gpu::open(adapter.as_deref())?;
+                let reason = format!("GPU executor on {}, as asked", gpu.adapter());
+                (Engine::gpu(gpu), reason)
+            }
+        };
+        eprintln!("{reason}");
+        Ok(match self.memory {
+            Some(bytes) => engine.with_budget(bytes),
+            None => engine,
+        })
+    }
+}
+
+/// Warnings of all crates on stderr; details, where `verbose`, of ours alone: wgpu's would bury them.
+fn log(verbose: bool) {
+    let level = if verbose { LevelFilter::DEBUG } else { LevelFilter::WARN };
+    let ours = ["sigma", "srn"].map(|prefix| (prefix, level));
+    let filter = Targets::new().with_default(LevelFilter::WARN).with_targets(ours);
+    let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    // A second call in one process keeps the first one's setting.
+    tracing_subscriber::registry().with(lines).with(filter).try_init().ok();
+}
+
+/// Bytes of `512MiB`, `2GB` and the like.
+fn memory(text: &str) -> std::result::Result<u64, String> {
+    let digits = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
+    let unit = match text[digits..].trim().to_ascii_lowercase().as_str() {
+        "" | "b" => 1.0,
+        "kib" | "k" => 1024.0,
+        "mib" | "m" => 1024.0 * 1024.0,
+        "gib" | "g" => 1024.0 * 1024.0 * 1024.0,
+        "kb" => 1e3,
+        "mb" => 1e6,
+        "gb" => 1e9,
+        _ => return Err("expected bytes, or a number with KiB, MiB, GiB, kB, MB or GB".into()),
+    };
+    match text[..digits].parse::<f64>() {
+        Ok(number) if number * unit >= 1.0 => Ok((number * unit) as u64),
+        _ => Err("expected a positive number of bytes".into()),
+    }
+}
+
+/// The exit code of a binary: 0 done, 1 did not converge or was stopped, 2 an error, which is printed in one line.
+pub fn finish(result: Result<bool>) -> ExitCode {
+    match result {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(1),
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// Reads a set of SRN instance folders as squares of `side` pixels.
+pub fn load_set(dir: &Path, side: u32) -> Result<Dataset> {
+    Ok(SrnSet::open(dir)?.load(side as usize)?)
+}
+
+/// `world_from_camera` and intrinsics of a view, as the library takes them.
+pub fn camera(view: &LoadedView) -> (DMat4, Intrinsics) {
+    let [fx, fy, cx, cy] = view.intrinsics.map(f64::from);
+    let world_from_camera = DMat4::from_cols_array(&view.world_from_camera).transpose();
+    (world_from_camera, Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 })
+}
+
+/// Peak signal-to-noise ratio in dB of colours in [-1, 1], the rendered ones clamped to that range as a picture would be.
+pub fn psnr(rendered: &[f32], target: &[f32]) -> f64 {
+    let squares = rendered.iter().zip(target).map(|(r, t)| f64::from(r.clamp(-1.0, 1.0) - t).powi(2));
+    10.0 * (4.0 * target.len() as f64 / squares.sum::<f64>()).log10()
+}
+
+/// A bar on stderr, with position, message and time left; nothing where stderr is not a terminal.
+pub fn progress(len: u64, what: &str) -> ProgressBar {
+    let template = format!("{what} {{bar:24}} {{pos}}/{{len}} {{msg}} {{eta}} left");
+    let style = ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
+    let bar = ProgressBar::new(len).with_style(style);
+    bar.enable_steady_tick(Duration::from_millis(500));
+    bar
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_sizes() {
+        assert_eq!(
+            ["4096", "512MiB", "2GB", "1.5 GiB"].map(|text| memory(text).unwrap()),
+            [4096, 512 << 20, 2_000_000_000, 3 << 29]
+        );
+        for bad in ["", "MiB", "-1", "0", "12 parsecs", "1.2.3"] {
+            assert!(memory(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn psnr_of_a_known_error() {
+        assert!((psnr(&[0.0, 0.2, 3.0], &[0.2, 0.0, 1.0]) - 10.0 * (4.0 * 3.0 / 0.08f64).log10()).abs() < 1e-5);
+        assert_eq!(psnr(&[1.0], &[1.0]), f64::INFINITY);
+    }
+}
