@@ -84,7 +84,7 @@ pub fn fixed24(radius: f64) -> Vec<DMat4> {
 /// left about the world's z axis.
 pub fn neighbor4(rough: &DMat4) -> Vec<DMat4> {
     let own_x = rough.x_axis.truncate().normalize();
-    [(own_x, -30.0f64), (own_x, 30.0), (DVec3::Z, 30.0), (DVec3::Z, -30.0)]
+    [(own_x, 30.0f64), (own_x, -30.0), (DVec3::Z, 30.0), (DVec3::Z, -30.0)]
         .into_iter()
         .map(|(axis, degrees)| DMat4::from_axis_angle(axis, degrees.to_radians()) * *rough)
         .collect()

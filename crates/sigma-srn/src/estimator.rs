@@ -69,6 +69,40 @@ impl Options {
         ];
         Options { loss: Loss::Mae, phases, keep_best: true, seed: 0 }
     }
+
+    /// The same with `steps` steps in all, shared between the phases in their present proportions.
+    pub fn with_steps(mut self, steps: u32) -> Self {
+        let total = self.phases.iter().map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
+        let (mut before, mut done) = (0, 0);
+        for phase in &mut self.phases {
+            before += u64::from(phase.steps);
+            let until = (2 * before * u64::from(steps) + total) / (2 * total);
+            phase.steps = until as u32 - done;
+            done = until as u32;
+        }
+        self
+    }
+
+    /// The same with all learning rates scaled, so that the first one is `first`.
+    pub fn with_learning_rate(mut self, first: f64) -> Self {
+        let scale = self.phases.first().map_or(1.0, |phase| first / phase.learning_rate.0);
+        for phase in &mut self.phases {
+            phase.learning_rate = (scale * phase.learning_rate.0, scale * phase.learning_rate.1);
+        }
+        self
+    }
+
+    /// The same with this stride in every phase.
+    pub fn with_stride(mut self, stride: u32) -> Self {
+        self.phases.iter_mut().for_each(|phase| phase.stride = stride);
+        self
+    }
+
+    /// The same with all starts in every phase.
+    pub fn without_culling(mut self) -> Self {
+        self.phases.iter_mut().for_each(|phase| phase.keep = usize::MAX);
+        self
+    }
 }
 
 /// Where one start ended.
@@ -96,7 +130,7 @@ pub struct Estimate {
     pub ranking: Vec<Ranked>,
 }
 
-/// What an observer of [`estimate`] sees after every step.
+/// What an observer of [`estimate`] sees before every step, and at the end of every phase: poses, and the losses there.
 pub struct Progress<'a> {
     /// Steps done, over all phases.
     pub step: u32,
@@ -118,7 +152,8 @@ struct Hypothesis {
     phases: usize,
 }
 
-/// Estimates the poses of all queries in one batch. `observe` is called after every step.
+/// Estimates the poses of all queries in one batch. `observe` is called after every evaluation: before each step, and at the end
+/// of each phase.
 pub fn estimate(
     engine: &Engine,
     model: &Model,
@@ -153,11 +188,12 @@ pub fn estimate(
             let mut random = stream(options.seed, 1 + u64::from(step));
             descent.set_initial_depths(&initial_depths(&mut random, rows))?;
             descent.evaluate()?;
+            observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
             descent.descend(learning_rate(phase, k))?;
             step += 1;
-            observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
         }
         descent.evaluate()?;
+        observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
         let last: Vec<(f64, Pose6)> = descent.losses()?.into_iter().zip(descent.poses()?).collect();
         let best = descent.best()?;
         for ((hypothesis, last), best) in running.iter_mut().zip(last).zip(best) {
@@ -268,4 +304,25 @@ fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Erro
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_and_learning_rates_keep_their_proportions() {
+        for steps in [0, 1, 7, 250, 1000] {
+            let options = Options::culled().with_steps(steps);
+            assert_eq!(options.phases.iter().map(|phase| phase.steps).sum::<u32>(), steps);
+        }
+        let culled = Options::culled();
+        let total = culled.phases.iter().map(|phase| phase.steps).sum();
+        assert_eq!(culled.clone().with_steps(total), culled);
+        let faster = culled.clone().with_learning_rate(2.0 * culled.phases[0].learning_rate.0);
+        for (phase, before) in faster.phases.iter().zip(&culled.phases) {
+            assert!((phase.learning_rate.1 - 2.0 * before.learning_rate.1).abs() < 1e-15);
+        }
+        assert!(culled.with_stride(1).without_culling().phases.iter().all(|phase| (phase.stride, phase.keep) == (1, usize::MAX)));
+    }
 }
