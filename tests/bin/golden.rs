@@ -6,6 +6,8 @@ use std::process::ExitCode;
 use sigma_srn::{Engine, Gpu};
 use srn_tests::golden::{Limits, check};
 
+const USAGE: &str = "usage: golden DIR [--executor cpu64|cpu|gpu]";
+
 fn main() -> ExitCode {
     match run() {
         Ok(true) => ExitCode::SUCCESS,
@@ -19,8 +21,14 @@ fn main() -> ExitCode {
 
 fn run() -> Result<bool, String> {
     let mut arguments = std::env::args().skip(1);
-    let folder = PathBuf::from(arguments.next().ok_or("usage: golden DIR [cpu64|cpu|gpu …]")?);
-    let wanted: Vec<String> = arguments.collect();
+    let folder = PathBuf::from(arguments.next().ok_or(USAGE)?);
+    let mut wanted = Vec::new();
+    while let Some(argument) = arguments.next() {
+        match (argument.as_str(), arguments.next()) {
+            ("--executor", Some(name)) if ["cpu64", "cpu", "gpu"].contains(&name.as_str()) => wanted.push(name),
+            _ => return Err(USAGE.into()),
+        }
+    }
     let mut engines = vec![("cpu64", Engine::cpu_f64(), Limits::F64), ("cpu", Engine::cpu(), Limits::F32)];
     if wanted.is_empty() || wanted.iter().any(|name| name == "gpu") {
         let gpu = Gpu::open(None).map_err(|error| error.to_string())?;

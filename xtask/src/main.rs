@@ -1,1 +1,71 @@
-fn main(){}
+//! The project's own commands: `cargo xtask COMMAND`. Uses the standard library only, so that it builds in a second.
+
+mod checks;
+mod demo;
+mod new_op;
+mod setup;
+mod shell;
+
+use std::process::ExitCode;
+
+/// A command: its name, its arguments, what it does, and the function that does it.
+struct Command {
+    name: &'static str,
+    arguments: &'static str,
+    about: &'static str,
+    run: fn(&[String]) -> Result<(), String>,
+}
+
+const COMMANDS: &[Command] = &[
+    Command { name: "demo", arguments: "", about: "find poses of unseen pictures with the shipped model", run: demo::run },
+    Command { name: "test", arguments: "", about: "every test, GPU tests included", run: checks::test },
+    Command { name: "lint", arguments: "", about: "formatting, clippy, documentation; warnings are errors", run: checks::lint },
+    Command { name: "ci", arguments: "", about: "everything that CI checks, the cheapest first", run: checks::ci },
+    Command { name: "setup", arguments: "", about: "what the tests need beside Rust: a Vulkan driver", run: setup::run },
+    Command {
+        name: "golden",
+        arguments: "DIR [--executor cpu64|cpu|gpu]",
+        about: "every golden file of a folder on every executor",
+        run: checks::golden,
+    },
+    Command {
+        name: "bench",
+        arguments: "[--quick] [--json] [--write]",
+        about: "time and GFLOP/s of a pose step, on every executor",
+        run: |arguments| shell::bin("bench", arguments),
+    },
+    Command {
+        name: "table",
+        arguments: "[--check]",
+        about: "print the table of kernels into shaders/README.md, or compare it",
+        run: |arguments| shell::bin("table", arguments),
+    },
+    Command { name: "new-op", arguments: "OP DIRECTION", about: "skeletons of a kernel's five parts", run: new_op::run },
+];
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let Some((name, rest)) = arguments.split_first() else {
+        usage();
+        return ExitCode::SUCCESS;
+    };
+    let Some(command) = COMMANDS.iter().find(|command| command.name == name) else {
+        eprintln!("error: no command is called `{name}`");
+        usage();
+        return ExitCode::from(2);
+    };
+    match (command.run)(rest) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(what) => {
+            eprintln!("error: {what}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn usage() {
+    println!("cargo xtask COMMAND\n");
+    for command in COMMANDS {
+        println!("  {:<40} {}", format!("{} {}", command.name, command.arguments), command.about);
+    }
+}

@@ -1,0 +1,59 @@
+//! What must hold before a change is in: the same here and in CI.
+
+use std::time::Instant;
+
+use crate::shell::{self, Count, cargo};
+use crate::{demo, setup};
+
+/// Formatting, clippy and documentation.
+pub fn lint(_: &[String]) -> Result<(), String> {
+    shell::run(cargo().args(["fmt", "--all", "--check"]))?;
+    shell::run(cargo().args(["clippy", "--quiet", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"]))?;
+    let mut doc = cargo();
+    doc.args(["doc", "--quiet", "--release", "--workspace", "--no-deps", "--document-private-items"]);
+    shell::run(doc.env("RUSTDOCFLAGS", "-D warnings"))
+}
+
+/// All tests; a missing adapter is a failure.
+pub fn test(arguments: &[String]) -> Result<(), String> {
+    setup::run(&[])?;
+    println!("{}", all_tests(arguments)?);
+    Ok(())
+}
+
+/// The golden files of a folder.
+pub fn golden(arguments: &[String]) -> Result<(), String> {
+    shell::bin("golden", arguments)
+}
+
+/// Everything, the cheapest first; the last line counts the tests.
+pub fn ci(_: &[String]) -> Result<(), String> {
+    let begin = Instant::now();
+    let mut count = Count::default();
+    stage("set-up", || setup::run(&[]))?;
+    stage("lint", || lint(&[]))?;
+    stage("house tests", || house_tests().map(drop))?;
+    stage("tests", || all_tests(&[]).map(|tests| count = tests))?;
+    stage("golden values", || golden(&["tests/golden".into()]))?;
+    stage("demo", || demo::run(&[]))?;
+    println!("── everything passed in {:.0} s", begin.elapsed().as_secs_f64());
+    println!("{count}");
+    Ok(())
+}
+
+fn house_tests() -> Result<Count, String> {
+    shell::count_tests(cargo().args(["test", "--quiet", "--release", "--workspace", "--test", "house"]))
+}
+
+fn all_tests(arguments: &[String]) -> Result<Count, String> {
+    shell::bin("adapters", &[] as &[&str])?;
+    shell::count_tests(cargo().args(["test", "--release", "--workspace", "--no-fail-fast"]).args(arguments))
+}
+
+fn stage(name: &str, work: impl FnOnce() -> Result<(), String>) -> Result<(), String> {
+    println!("── {name}");
+    let begin = Instant::now();
+    let result = work();
+    println!("── {name}: {:.0} s", begin.elapsed().as_secs_f64());
+    result
+}
