@@ -215,4 +215,3 @@ references! {
     "keep_best/step" => keep_best::step(f f) -> (f_mut f_mut);
     "pack_rgba8/forward" => pack_rgba8::forward(f) -> (u_mut);
 }
-

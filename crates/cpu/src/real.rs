@@ -25,7 +25,9 @@ pub trait Real: Float + AddAssign + Sum + Default + Send + Sync + std::fmt::Debu
     /// `tanh x`, exact to a few units in the last place of 1.
     #[inline(always)]
     fn hyperbolic_tangent(self) -> Self {
-        let e = (self + self).min(Self::of(80.0)).exponential();
+        let limit = Self::of(20.0);
+        let e = if self > limit { limit } else { self };
+        let e = (e + e).exponential();
         (e - Self::one()) / (e + Self::one())
     }
 }
@@ -66,7 +68,8 @@ impl Real for f32 {
     fn exponential(self) -> Self {
         let x = self.clamp(-87.0, 88.0);
         let magic = 12_582_912.0; // 1.5 · 2^23: adding it rounds to an integer
-        let n = (x * std::f32::consts::LOG2_E + magic) - magic;
+        let shifted = x * std::f32::consts::LOG2_E + magic;
+        let n = shifted - magic;
         let r = (x - n * 0.693_359_4) + n * 2.121_944_4e-4; // ln 2 in two parts
         let p = 1.0 / 5040.0;
         let p = p * r + 1.0 / 720.0;
@@ -76,7 +79,8 @@ impl Real for f32 {
         let p = p * r + 0.5;
         let p = p * r + 1.0;
         let p = p * r + 1.0;
-        p * f32::from_bits(((n as i32 + 127) << 23) as u32)
+        // The low bits of `shifted` are n: no conversion to an integer is needed.
+        p * f32::from_bits(shifted.to_bits().wrapping_add(127) << 23)
     }
 }
 

@@ -34,20 +34,39 @@ pub(crate) use vectorised;
 
 use crate::Real;
 
-const LANES: usize = 16;
+/// Values that are worked on together.
+pub(crate) const LANES: usize = 16;
 
-/// `Σ term(i)` over `0..count`, in sixteen interleaved sums: a fixed order that vectorises.
+/// The values at `start..start + LANES`, zeros beyond the end: short rows vectorise too.
 #[inline(always)]
-pub(crate) fn sum<T: Real>(count: usize, term: impl Fn(usize) -> T) -> T {
+pub(crate) fn load<T: Real>(values: &[T], start: usize) -> [T; LANES] {
+    match values.get(start..start + LANES) {
+        Some(whole) => whole.try_into().expect("a slice of this length"),
+        None => std::array::from_fn(|lane| values.get(start + lane).copied().unwrap_or(T::zero())),
+    }
+}
+
+/// The inverse of [`load`]: what lies beyond the end is dropped.
+#[inline(always)]
+pub(crate) fn store<T: Real>(values: &mut [T], start: usize, lanes: [T; LANES]) {
+    match values.get_mut(start..start + LANES) {
+        Some(whole) => whole.copy_from_slice(&lanes),
+        None => values[start..].iter_mut().zip(lanes).for_each(|(value, lane)| *value = lane),
+    }
+}
+
+/// `Σ term(a[i], b[i])`, in sixteen interleaved sums: a fixed order that vectorises. `a` and `b` have the same length.
+#[inline(always)]
+pub(crate) fn sum<T: Real>(a: &[T], b: &[T], term: impl Fn(T, T) -> T) -> T {
     let mut lanes = [T::zero(); LANES];
-    let whole = count / LANES * LANES;
-    for start in (0..whole).step_by(LANES) {
-        for (lane, value) in lanes.iter_mut().enumerate() {
-            *value += term(start + lane);
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    for (a, b) in a.iter().zip(b) {
+        for lane in 0..LANES {
+            lanes[lane] += term(a[lane], b[lane]);
         }
     }
-    for index in whole..count {
-        lanes[index - whole] += term(index);
+    for (lane, (&a, &b)) in a_rest.iter().zip(b_rest).enumerate() {
+        lanes[lane] += term(a, b);
     }
     lanes.iter().copied().sum()
 }

@@ -112,6 +112,11 @@ impl Plan {
         &self.stages[id.index()]
     }
 
+    /// The id of stage number `index`.
+    pub fn stage_id(&self, index: usize) -> StageId {
+        StageId(index as u32)
+    }
+
     /// The buffer called `name`: for tests and reports.
     pub fn find(&self, name: &str) -> Option<BufferId> {
         self.buffers.iter().position(|buffer| buffer.name == name).map(|index| BufferId(index as u32))

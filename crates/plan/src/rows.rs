@@ -43,7 +43,9 @@ pub fn tiles(images: u32, rows_per_image: u32, most: u32) -> Vec<Tile> {
     if rows_per_image <= most {
         even_parts(images, most / rows_per_image).map(|(first, count)| tile(first, count, 0, rows_per_image)).collect()
     } else {
-        (0..images).flat_map(|image| even_parts(rows_per_image, most).map(move |(first, count)| tile(image, 1, first, count))).collect()
+        (0..images)
+            .flat_map(|image| even_parts(rows_per_image, most).map(move |(first, count)| tile(image, 1, first, count)))
+            .collect()
     }
 }
 
@@ -62,7 +64,8 @@ mod tests {
 
     #[test]
     fn tiles_cover_every_row_once() {
-        for (images, rows, most) in [(1, 1, 1), (3, 256, 8192), (24, 4096, 8192), (5, 4096, 1000), (7, 4096, 4096), (2, 100, 33)] {
+        for (images, rows, most) in [(1, 1, 1), (3, 256, 8192), (24, 4096, 8192), (5, 4096, 1000), (7, 4096, 4096), (2, 100, 33)]
+        {
             let mut seen = vec![0u32; (images * rows) as usize];
             for tile in tiles(images, rows, most) {
                 assert!(tile.rows.count() <= most && tile.rows.count() > 0);

@@ -88,7 +88,8 @@ impl Descent {
             return Err(Error::Setting { field: "loss", what: format!("GMSD needs 2 × 2 pixels, got {width} × {height}") });
         }
         let rows = hypotheses * width * height;
-        let (plan, handles) = engine.fit(rows, |tile_rows| build(engine.builder(), model, shape, loss, tile_rows))?;
+        let (plan, handles) =
+            engine.fit(rows, model.layout.features(), |tile_rows| build(engine.builder(), model, shape, loss, tile_rows))?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, model)?;
         Ok(Descent { runner, handles, shape, steps: 0 })

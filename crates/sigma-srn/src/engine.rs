@@ -11,8 +11,8 @@ use crate::Error;
 
 /// Memory that a plan may take on the CPU where the user sets no budget, in bytes.
 const CPU_BUDGET: u64 = 2 << 30;
-/// Rows of a tile on the CPU: the working set of a layer stays in the caches.
-const CPU_TILE_ROWS: u32 = 1024;
+/// Values of one layer of a tile on the CPU: large enough to keep the threads busy, small enough to stay in the caches.
+const CPU_TILE_VALUES: u32 = 1 << 18;
 /// Rows of a tile on a GPU: enough to fill a large one.
 const GPU_TILE_ROWS: u32 = 32_768;
 
@@ -29,13 +29,14 @@ enum Kind {
 pub struct Engine {
     kind: Kind,
     budget: u64,
-    tile_rows: u32,
+    /// The user's choice; by kind and width of the network where there is none.
+    tile_rows: Option<u32>,
 }
 
 impl Engine {
     /// The CPU in `f32`, with all threads of the current rayon pool.
     pub fn cpu() -> Self {
-        Engine { kind: Kind::Cpu, budget: CPU_BUDGET, tile_rows: CPU_TILE_ROWS }
+        Engine { kind: Kind::Cpu, budget: CPU_BUDGET, tile_rows: None }
     }
 
     /// The CPU in `f64`: the oracle of the tests.
@@ -46,7 +47,7 @@ impl Engine {
     /// A GPU, or a software adapter: opened by [`Gpu::open`], or made from the caller's device by [`Gpu::from_device`].
     pub fn gpu(gpu: Gpu) -> Self {
         let budget = gpu.default_memory_budget();
-        Engine { kind: Kind::Gpu(gpu), budget, tile_rows: GPU_TILE_ROWS }
+        Engine { kind: Kind::Gpu(gpu), budget, tile_rows: None }
     }
 
     /// The GPU where there is an adapter that is not a software one, else whichever executor is faster on a small matrix
@@ -80,7 +81,7 @@ impl Engine {
 
     /// The same with at most `rows` rays in flight.
     pub fn with_tile_rows(self, rows: u32) -> Self {
-        Engine { tile_rows: rows.max(1), ..self }
+        Engine { tile_rows: Some(rows.max(1)), ..self }
     }
 
     /// The memory budget in bytes.
@@ -104,9 +105,19 @@ impl Engine {
         })
     }
 
-    /// Builds a plan with the largest tiles that fit the budget and the device's limits; `build` gets the rows of a tile.
-    pub(crate) fn fit<T>(&self, rows: u32, build: impl Fn(u32) -> Result<(Plan, T), PlanError>) -> Result<(Plan, T), Error> {
-        let mut tile_rows = rows.min(self.tile_rows).max(1);
+    /// Builds a plan with the largest tiles that fit the budget and the device's limits, for a network of `features`
+    /// wide layers; `build` gets the rows of a tile.
+    pub(crate) fn fit<T>(
+        &self,
+        rows: u32,
+        features: u32,
+        build: impl Fn(u32) -> Result<(Plan, T), PlanError>,
+    ) -> Result<(Plan, T), Error> {
+        let preferred = self.tile_rows.unwrap_or(match &self.kind {
+            Kind::Gpu(_) => GPU_TILE_ROWS,
+            Kind::Cpu | Kind::CpuF64 => CPU_TILE_VALUES / features.max(1),
+        });
+        let mut tile_rows = rows.min(preferred).max(1);
         loop {
             let needed = match build(tile_rows) {
                 Ok((plan, rest)) if self.bytes(&plan) <= self.budget => return Ok((plan, rest)),

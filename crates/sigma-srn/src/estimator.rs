@@ -174,7 +174,8 @@ pub fn estimate(
         let mut running: Vec<Hypothesis> = Vec::new();
         let mut dropped: Vec<Hypothesis> = Vec::new();
         for query in 0..queries.len() {
-            let mut own: Vec<Hypothesis> = hypotheses.iter().copied().filter(|h| h.query == query && h.phases == number).collect();
+            let mut own: Vec<Hypothesis> =
+                hypotheses.iter().copied().filter(|h| h.query == query && h.phases == number).collect();
             own.sort_by(|a, b| a.loss.total_cmp(&b.loss));
             let rest = own.split_off(phase.keep.min(own.len()));
             running.extend(own);

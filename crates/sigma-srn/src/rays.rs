@@ -48,7 +48,5 @@ impl Rays {
 pub fn pixel_grid(width: u32, height: u32, stride: u32) -> impl Iterator<Item = (u32, u32)> {
     let stride = stride.max(1);
     let first = stride / 2;
-    (first..height)
-        .step_by(stride as usize)
-        .flat_map(move |v| (first..width).step_by(stride as usize).map(move |u| (u, v)))
+    (first..height).step_by(stride as usize).flat_map(move |v| (first..width).step_by(stride as usize).map(move |u| (u, v)))
 }

@@ -49,8 +49,9 @@ impl Renderer {
             }
         }
         let rays = width * height;
-        let (plan, handles) =
-            engine.fit(views * rays, |tile_rows| build(engine.builder(), model, views, [width, height], tile_rows))?;
+        let (plan, handles) = engine.fit(views * rays, model.layout.features(), |tile_rows| {
+            build(engine.builder(), model, views, [width, height], tile_rows)
+        })?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, model)?;
         let slots: Vec<u32> = (0..views).collect();
@@ -130,7 +131,13 @@ impl Renderer {
     }
 }
 
-fn build(mut b: Builder, model: &Model, views: u32, [width, height]: [u32; 2], tile_rows: u32) -> Result<(Plan, Handles), PlanError> {
+fn build(
+    mut b: Builder,
+    model: &Model,
+    views: u32,
+    [width, height]: [u32; 2],
+    tile_rows: u32,
+) -> Result<(Plan, Handles), PlanError> {
     let rays = width * height;
     let network = Network::new(&mut b, model, Batch { images: views, rays, slots: views }, Trainable::Nothing, true)?;
     let cut = tiles(views, rays, tile_rows);

@@ -93,7 +93,10 @@ impl Trainer {
                 return Err(Error::Setting { field, what: "must be at least 1".into() });
             }
         }
-        let (plan, handles) = engine.fit(images * rays, |tile_rows| build(engine.builder(), &model, train, batch, tile_rows))?;
+        let (plan, handles) = {
+            let features = model.layout.features();
+            engine.fit(images * rays, features, |tile_rows| build(engine.builder(), &model, train, batch, tile_rows))?
+        };
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, &model)?;
         let slots: Vec<u32> = (0..images).collect();
@@ -242,7 +245,8 @@ fn build(mut b: Builder, model: &Model, train: Train, batch: Batch, tile_rows: u
     let hyper_scratch = HyperScratch::new(b, &network)?;
     let codes_count = batch.slots * network.latent;
     let partial_len = cut.iter().map(|tile| backward::partial_len(&network, tile.rows)).max().unwrap_or(1);
-    let sums = image_loss::partial_len(images, rays).max(depth_loss::partial_len(rows)).max(latent_loss::partial_len(codes_count));
+    let sums =
+        image_loss::partial_len(images, rays).max(depth_loss::partial_len(rows)).max(latent_loss::partial_len(codes_count));
     let partial = b.scratch("partial sums", partial_len.max(sums))?;
     let target = b.input("target rgb", 3 * rows as usize)?;
     let tile_target = b.scratch("tile target", 3 * most as usize)?;

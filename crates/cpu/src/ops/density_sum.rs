@@ -17,9 +17,9 @@ pub fn forward<T: Real>(p: PointParams, density: &[T], feature: &[T], phi: &mut 
 vectorised! {
     fn forward_rows<T: Real>(accumulate: bool, width: usize, density: &[T], feature: &[T], phi: &mut [T]) {
         for ((phi, feature), &density) in phi.chunks_exact_mut(width).zip(feature.chunks_exact(width)).zip(density) {
-            for i in 0..width {
-                let before = if accumulate { phi[i] } else { T::zero() };
-                phi[i] = before + density * feature[i];
+            for (phi, &feature) in phi.iter_mut().zip(feature) {
+                let before = if accumulate { *phi } else { T::zero() };
+                *phi = before + density * feature;
             }
         }
     }
@@ -37,9 +37,9 @@ vectorised! {
     fn backward_rows<T: Real>(width: usize, density: &[T], feature: &[T], d_phi: &[T], d_density: &mut [T], d_feature: &mut [T]) {
         for (row, (d_feature, d_density)) in d_feature.chunks_exact_mut(width).zip(d_density).enumerate() {
             let (feature, d_phi) = (&feature[row * width..][..width], &d_phi[row * width..][..width]);
-            *d_density = sum(width, |i| d_phi[i] * feature[i]);
-            for i in 0..width {
-                d_feature[i] = density[row] * d_phi[i];
+            *d_density = sum(d_phi, feature, |d_phi, feature| d_phi * feature);
+            for (d_feature, &d_phi) in d_feature.iter_mut().zip(d_phi) {
+                *d_feature = density[row] * d_phi;
             }
         }
     }

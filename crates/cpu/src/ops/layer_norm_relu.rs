@@ -23,11 +23,12 @@ vectorised! {
         let (gamma, beta) = affine.split_at(width);
         let count = T::of(width as f64);
         for ((x, y), stats) in x.chunks_exact(width).zip(y.chunks_exact_mut(width)).zip(stats.chunks_exact_mut(2)) {
-            let mean = sum(width, |i| x[i]) / count;
-            let variance = sum(width, |i| (x[i] - mean) * (x[i] - mean)) / count;
+            let mean = sum(x, x, |x, _| x) / count;
+            let variance = sum(x, x, |x, _| (x - mean) * (x - mean)) / count;
             let rstd = T::one() / (variance + T::of(EPSILON)).sqrt();
-            for i in 0..width {
-                y[i] = ((x[i] - mean) * rstd * gamma[i] + beta[i]).max(T::zero());
+            for (((y, &x), &gamma), &beta) in y.iter_mut().zip(x).zip(gamma).zip(beta) {
+                let value = (x - mean) * rstd * gamma + beta;
+                *y = if value > T::zero() { value } else { T::zero() };
             }
             stats[0] = mean;
             stats[1] = rstd;
@@ -51,15 +52,15 @@ vectorised! {
         for (row, d_x) in d_x.chunks_exact_mut(width).enumerate() {
             let (x, d_y) = (&x[row * width..][..width], &d_y[row * width..][..width]);
             let [mean, rstd] = [stats[2 * row], stats[2 * row + 1]];
-            let normalised = |i: usize| (x[i] - mean) * rstd;
-            for i in 0..width {
-                let live = normalised(i) * gamma[i] + beta[i] > T::zero();
-                d_x[i] = if live { gamma[i] * d_y[i] } else { T::zero() };
+            let normalised = |x: T| (x - mean) * rstd;
+            for ((((d_x, &x), &d_y), &gamma), &beta) in d_x.iter_mut().zip(x).zip(d_y).zip(gamma).zip(beta) {
+                let live = normalised(x) * gamma + beta > T::zero();
+                *d_x = if live { gamma * d_y } else { T::zero() };
             }
-            let mean_e = sum(width, |i| d_x[i]) / count;
-            let mean_ex = sum(width, |i| d_x[i] * normalised(i)) / count;
-            for i in 0..width {
-                d_x[i] = rstd * (d_x[i] - mean_e - normalised(i) * mean_ex);
+            let mean_e = sum(d_x, d_x, |e, _| e) / count;
+            let mean_ex = sum(d_x, x, |e, x| e * normalised(x)) / count;
+            for (d_x, &x) in d_x.iter_mut().zip(x) {
+                *d_x = rstd * (*d_x - mean_e - normalised(x) * mean_ex);
             }
         }
     }
@@ -82,11 +83,12 @@ vectorised! {
         let (gamma, beta) = affine.split_at(width);
         let (d_gamma, d_beta) = partial.split_at_mut(width);
         for ((x, d_y), stats) in x.chunks_exact(width).zip(d_y.chunks_exact(width)).zip(stats.chunks_exact(2)) {
-            for i in 0..width {
-                let normalised = (x[i] - stats[0]) * stats[1];
-                let d = if normalised * gamma[i] + beta[i] > T::zero() { d_y[i] } else { T::zero() };
-                d_gamma[i] += d * normalised;
-                d_beta[i] += d;
+            let d_affine = d_gamma.iter_mut().zip(&mut *d_beta);
+            for ((((d_gamma, d_beta), (&x, &d_y)), &gamma), &beta) in d_affine.zip(x.iter().zip(d_y)).zip(gamma).zip(beta) {
+                let normalised = (x - stats[0]) * stats[1];
+                let d = if normalised * gamma + beta > T::zero() { d_y } else { T::zero() };
+                *d_gamma += d * normalised;
+                *d_beta += d;
             }
         }
     }

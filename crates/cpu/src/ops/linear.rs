@@ -53,12 +53,7 @@ fn weights_of<'a, T>(p: LinearParams, weights: &'a [T], slots: &[u32], group: us
 
 /// Calls `work(group, first row, block, threads)` for the blocks of all groups: blocks in parallel where there are several,
 /// else one block whose product the library may split.
-fn for_blocks<T: Send>(
-    p: LinearParams,
-    out: &mut [T],
-    width: usize,
-    work: impl Fn(usize, usize, &mut [T], Parallelism) + Sync,
-) {
+fn for_blocks<T: Send>(p: LinearParams, out: &mut [T], width: usize, work: impl Fn(usize, usize, &mut [T], Parallelism) + Sync) {
     let rows = p.rows_per_group as usize;
     let out = &mut out[..p.groups as usize * rows * width];
     if p.groups == 1 && rows <= BLOCK_ROWS {

@@ -34,11 +34,7 @@ pub fn backward<T: Real>(p: PoseParams, pose6: &[T], d_world_from_camera: &[T], 
                 [-s1 * s3 + c3 * c1 * s2, -s1 * c3 - c1 * s2 * s3, -c2 * c1],
                 [c1 * s3 + s1 * c3 * s2, c3 * c1 - s1 * s2 * s3, -s1 * c2],
             ],
-            [
-                [-s2 * c3, s2 * s3, c2],
-                [c3 * s1 * c2, -s1 * c2 * s3, s2 * s1],
-                [-c1 * c3 * c2, c1 * c2 * s3, -c1 * s2],
-            ],
+            [[-s2 * c3, s2 * s3, c2], [c3 * s1 * c2, -s1 * c2 * s3, s2 * s1], [-c1 * c3 * c2, c1 * c2 * s3, -c1 * s2]],
             [
                 [-c2 * s3, -c2 * c3, zero],
                 [c1 * c3 - s3 * s1 * s2, -c1 * s3 - s1 * s2 * c3, zero],

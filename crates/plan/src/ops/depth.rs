@@ -8,11 +8,8 @@ use crate::{BufferId, Builder, PlanError, Rows};
 /// `x [rows,3]` → `depth [rows]`.
 pub fn forward(b: &mut Builder, rows: Rows, world_from_camera: BufferId, x: BufferId, depth: BufferId) -> Result<(), PlanError> {
     let n = rows.count();
-    let args = [
-        read(world_from_camera, size([rows.first_group + rows.groups, 12])),
-        read(x, size([n, 3])),
-        overwrite(depth, size([n])),
-    ];
+    let args =
+        [read(world_from_camera, size([rows.first_group + rows.groups, 12])), read(x, size([n, 3])), overwrite(depth, size([n]))];
     b.step(&DEPTH_FORWARD, params(rows, 0.0), &args, [n, 1, 1], 0, 0)
 }
 

@@ -18,21 +18,15 @@ pub struct Embedding {
 
 /// `codes [instances, latent]`, `index [batch]` → `z [batch, latent]`.
 pub fn forward(b: &mut Builder, e: Embedding, codes: BufferId, index: BufferId, z: BufferId) -> Result<(), PlanError> {
-    let args = [
-        read(codes, size([e.instances, e.latent])),
-        read(index, size([e.batch])),
-        overwrite(z, size([e.batch, e.latent])),
-    ];
+    let args =
+        [read(codes, size([e.instances, e.latent])), read(index, size([e.batch])), overwrite(z, size([e.batch, e.latent]))];
     b.step(&EMBEDDING_FORWARD, params(e), &args, [e.batch * e.latent, 1, 1], 0, 0)
 }
 
 /// `d_z [batch, latent]` → `d_codes [instances, latent]`, zero for instances outside the batch.
 pub fn backward(b: &mut Builder, e: Embedding, index: BufferId, d_z: BufferId, d_codes: BufferId) -> Result<(), PlanError> {
-    let args = [
-        read(index, size([e.batch])),
-        read(d_z, size([e.batch, e.latent])),
-        overwrite(d_codes, size([e.instances, e.latent])),
-    ];
+    let args =
+        [read(index, size([e.batch])), read(d_z, size([e.batch, e.latent])), overwrite(d_codes, size([e.instances, e.latent]))];
     b.step(&EMBEDDING_BACKWARD, params(e), &args, [e.instances * e.latent, 1, 1], e.batch.into(), 0)
 }
 

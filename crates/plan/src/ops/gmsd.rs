@@ -77,13 +77,7 @@ pub fn similarity(b: &mut Builder, images: Images, saved: Saved) -> Result<(), P
 }
 
 /// `quality` → `moments` → `loss [images]`, by way of `partial`.
-pub fn deviation(
-    b: &mut Builder,
-    images: Images,
-    saved: Saved,
-    partial: BufferId,
-    loss: BufferId,
-) -> Result<(), PlanError> {
+pub fn deviation(b: &mut Builder, images: Images, saved: Saved, partial: BufferId, loss: BufferId) -> Result<(), PlanError> {
     let params = images.params(0.0);
     let args = [read(saved.quality, images.pooled_len()), overwrite(partial, images.partial_len())];
     b.step(&GMSD_MOMENTS, params, &args, [images.count * params.chunks, 1, 1], CHUNK.into(), 0)?;

@@ -1,8 +1,6 @@
 //! Layer normalisation with gamma and beta, then ReLU. Without affine, the caller binds gamma = 1, beta = 0.
 
-use srn_shaders::{
-    LAYER_NORM_RELU_BACKWARD_AFFINE, LAYER_NORM_RELU_BACKWARD_INPUT, LAYER_NORM_RELU_FORWARD, LayerNormParams,
-};
+use srn_shaders::{LAYER_NORM_RELU_BACKWARD_AFFINE, LAYER_NORM_RELU_BACKWARD_INPUT, LAYER_NORM_RELU_FORWARD, LayerNormParams};
 
 use super::{overwrite, read, size, sum};
 use crate::{BufferId, Builder, PlanError};
@@ -24,12 +22,8 @@ pub struct Saved {
 /// `x [rows, features]` → `y [rows, features]`; overwrites `saved.stats`.
 pub fn forward(b: &mut Builder, rows: u32, features: u32, saved: Saved, y: BufferId) -> Result<(), PlanError> {
     let n = size([rows, features]);
-    let args = [
-        read(saved.x, n),
-        read(saved.affine, size([2, features])),
-        overwrite(y, n),
-        overwrite(saved.stats, size([rows, 2])),
-    ];
+    let args =
+        [read(saved.x, n), read(saved.affine, size([2, features])), overwrite(y, n), overwrite(saved.stats, size([rows, 2]))];
     b.step(&LAYER_NORM_RELU_FORWARD, params(rows, features, 0, 0), &args, [rows, 1, 1], 3 * u64::from(features), 0)
 }
 

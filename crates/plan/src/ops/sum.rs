@@ -34,8 +34,7 @@ pub fn forward(
     y: BufferId,
     accumulate: bool,
 ) -> Result<(), PlanError> {
-    let args =
-        [read(x, size([groups.count, terms, count])), output(y, size([groups.first + groups.count, count]), accumulate)];
+    let args = [read(x, size([groups.count, terms, count])), output(y, size([groups.first + groups.count, count]), accumulate)];
     let params = SumParams { groups: groups.count, first_group: groups.first, terms, count, accumulate: accumulate.into() };
     b.step(&SUM_FORWARD, params, &args, [groups.count * count, 1, 1], terms.into(), 0)
 }

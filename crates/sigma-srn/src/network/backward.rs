@@ -64,7 +64,18 @@ pub(crate) fn render(
     }
 
     let d_phi = Into { buffer: scratch.d_phi, accumulate: false };
-    mlp(b, network, rows, &network.pixel_generator, saved.phi, &saved.pixel_generator, scratch.d_rgb, inside, Some(d_phi), started)?;
+    mlp(
+        b,
+        network,
+        rows,
+        &network.pixel_generator,
+        saved.phi,
+        &saved.pixel_generator,
+        scratch.d_rgb,
+        inside,
+        Some(d_phi),
+        started,
+    )?;
 
     for i in (0..=last).rev() {
         let v = saved.scene[i].last().expect("f has layers").y;

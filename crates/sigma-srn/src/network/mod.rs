@@ -92,7 +92,13 @@ pub(crate) enum Trainable {
 
 impl Network {
     /// Adds the buffers. `world_from_camera` is a step's output when poses are estimated, else the caller's input.
-    pub fn new(b: &mut Builder, model: &Model, batch: Batch, trainable: Trainable, pose_is_input: bool) -> Result<Self, PlanError> {
+    pub fn new(
+        b: &mut Builder,
+        model: &Model,
+        batch: Batch,
+        trainable: Trainable,
+        pose_is_input: bool,
+    ) -> Result<Self, PlanError> {
         let layout = &model.layout;
         let mut parameters = Vec::new();
         let mut d_parameters = Vec::new();

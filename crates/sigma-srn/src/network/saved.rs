@@ -84,9 +84,7 @@ impl Saved {
                         stats: b.scratch(format!("{name}.{k} stats"), len(2))?,
                         y,
                     },
-                    Some(_) => {
-                        BlockSaved { z: reused.get(b, "z", len(widest))?, stats: reused.get(b, "stats", len(2))?, y }
-                    }
+                    Some(_) => BlockSaved { z: reused.get(b, "z", len(widest))?, stats: reused.get(b, "stats", len(2))?, y },
                 });
             }
             Ok::<_, PlanError>(saved)
