@@ -16,6 +16,11 @@ pub const GREY: Colour = [200; 3];
 pub const CURVES: [Colour; 7] =
     [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [230, 159, 0], [86, 180, 233], [90, 90, 90]];
 
+/// From nothing to much, light to dark: white, yellow, red, black.
+pub const HEAT: [Colour; 4] = [WHITE, [255, 200, 70], [200, 30, 30], [40, 0, 10]];
+/// From near to far, dark to light: the stops of viridis.
+pub const VIRIDIS: [Colour; 5] = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
+
 /// Width and height of a character of [`text`], in pixels.
 pub const GLYPH: u32 = 8;
 
@@ -36,6 +41,25 @@ pub fn text(image: &mut RgbImage, x: i32, y: i32, text: &str, colour: Colour) {
             }
         }
     }
+}
+
+/// Like [`text`], each pixel of the font `scale` pixels wide and high.
+pub fn title(image: &mut RgbImage, x: i32, y: i32, text: &str, scale: u32, colour: Colour) {
+    let mut small = blank(text.chars().count() as u32 * GLYPH, GLYPH);
+    self::text(&mut small, 0, 0, text, colour);
+    for (dx, dy, _) in enlarge(&small, scale).enumerate_pixels().filter(|(.., pixel)| pixel.0 == colour) {
+        put(image, x + dx as i32, y + dy as i32, colour);
+    }
+}
+
+/// The colour at `t` of 0 (first) to 1 (last) between equally spaced colours; grey where `t` is not a number.
+pub fn ramp(stops: &[Colour], t: f64) -> Colour {
+    if t.is_nan() || stops.is_empty() {
+        return GREY;
+    }
+    let at = t.clamp(0.0, 1.0) * (stops.len() - 1) as f64;
+    let (low, high) = (stops[at.floor() as usize], stops[at.ceil() as usize]);
+    std::array::from_fn(|c| (f64::from(low[c]) + at.fract() * (f64::from(high[c]) - f64::from(low[c]))).round() as u8)
 }
 
 /// Draws a straight line, one pixel wide, cut at the image's edges.
@@ -210,6 +234,20 @@ mod tests {
         assert!(count(&image, BLACK) > 10 && (8..16).all(|x| (0..8).all(|y| image.get_pixel(x, y).0 == WHITE)));
         text(&mut image, -3, -5, "outside", BLACK);
         text(&mut image, 14, 4, "outside σ ☃", BLACK);
+    }
+
+    #[test]
+    fn titles_are_enlarged_text() {
+        let [mut small, mut large] = [blank(20, 10), blank(60, 30)];
+        text(&mut small, 1, 1, "Aσ", BLACK);
+        title(&mut large, 3, 3, "Aσ", 3, BLACK);
+        assert_eq!(large, enlarge(&small, 3));
+    }
+
+    #[test]
+    fn ramps_go_through_their_stops() {
+        assert_eq!([0.0, 0.5, 1.0, -3.0, 7.0].map(|t| ramp(&VIRIDIS, t)), [0, 2, 4, 0, 4].map(|i| VIRIDIS[i]));
+        assert_eq!((ramp(&[BLACK, WHITE], 0.2), ramp(&HEAT, f64::NAN)), ([51; 3], GREY));
     }
 
     #[test]

@@ -185,19 +185,38 @@ pub fn load_square(path: &Path, intrinsics: &Intrinsics, side: usize) -> Result<
 
 /// Reads a pose file: 16 numbers, a rigid `world_from_camera`.
 pub fn read_pose(path: &Path) -> Result<DMat4> {
-    let pose = read_pose_unchecked(path)?;
+    rigid(path, "pose", read_pose_unchecked(path)?)
+}
+
+/// Reads a file of poses, one per line as in a pose file; empty lines and those that begin with `#` are left out. At least one.
+pub fn read_poses(path: &Path) -> Result<Vec<DMat4>> {
+    let text = std::fs::read_to_string(path).at(path)?;
+    let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
+    let pose = |(i, line)| {
+        let field = format!("line {}", i + 1);
+        rigid(path, &field, matrix(path, &field, line)?)
+    };
+    let poses: Vec<_> = lines.map(pose).collect::<Result<_>>()?;
+    if poses.is_empty() { Err(Error::field(path, "poses", "at least one line of 16 numbers", "none")) } else { Ok(poses) }
+}
+
+fn rigid(path: &Path, field: &str, pose: DMat4) -> Result<DMat4> {
     match rigid_error(&pose) {
         error if error <= RIGID_TOLERANCE => Ok(pose),
-        error if error >= 2.0 => Err(Error::field(path, "rotation", "a right-handed rotation", "a mirrored or scaled one")),
-        error => Err(Error::field(path, "pose", format!("a rigid motion within {RIGID_TOLERANCE}"), format!("{error:.3} off"))),
+        error if error >= 2.0 => Err(Error::field(path, field, "a right-handed rotation", "a mirrored or scaled one")),
+        error => Err(Error::field(path, field, format!("a rigid motion within {RIGID_TOLERANCE}"), format!("{error:.3} off"))),
     }
 }
 
 /// Reads a pose file: 16 finite numbers, no more is asked of them.
 pub(crate) fn read_pose_unchecked(path: &Path) -> Result<DMat4> {
-    let text = std::fs::read_to_string(path).at(path)?;
-    let values = numbers(path, "pose", &text)?;
-    let rows: [f64; 16] = values.as_slice().try_into().map_err(|_| Error::field(path, "pose", "16 numbers", values.len()))?;
+    matrix(path, "pose", &std::fs::read_to_string(path).at(path)?)
+}
+
+/// 16 finite numbers, row-major.
+fn matrix(path: &Path, field: &str, text: &str) -> Result<DMat4> {
+    let values = numbers(path, field, text)?;
+    let rows: [f64; 16] = values.as_slice().try_into().map_err(|_| Error::field(path, field, "16 numbers", values.len()))?;
     Ok(DMat4::from_cols_array(&rows).transpose())
 }
 
@@ -345,6 +364,17 @@ mod tests {
         assert!(pose.contains("right-handed"), "{pose}");
         write(&path, "0 0 1 -2\n-1 0 0 0\n0 -1 0 0\n0 0 0 1\n").unwrap();
         assert_eq!(read_pose(&path).unwrap().w_axis.to_array(), [-2.0, 0.0, 0.0, 1.0]);
+
+        let line = "0 0 1 -2 -1 0 0 0 0 -1 0 0 0 0 0 1";
+        write(&path, format!("# two poses\n{line}\n\n  {line}\n")).unwrap();
+        assert_eq!(read_poses(&path).unwrap().len(), 2);
+        for (text, words) in
+            [("# none", "at least one"), ("1 2 3", "line 1: expected 16"), (&line.replace("-2", "NaN"), "finite")]
+        {
+            write(&path, text).unwrap();
+            let error = read_poses(&path).unwrap_err().to_string();
+            assert!(error.contains("pose.txt") && error.contains(words), "{error}");
+        }
     }
 
     /// Breaks one file of a good set; the error must name that file and hold the given words.

@@ -103,6 +103,17 @@ impl Options {
         self.phases.iter_mut().for_each(|phase| phase.keep = usize::MAX);
         self
     }
+
+    /// The same, but where all starts would run to the end, only the best 6 do so after a fifth of the steps.
+    pub fn with_culling(mut self) -> Self {
+        let all_to_the_end = self.phases.iter().all(|phase| phase.keep == usize::MAX);
+        if let Some(last) = self.phases.last_mut().filter(|_| all_to_the_end) {
+            let first = Phase { steps: last.steps / 5, ..*last };
+            *last = Phase { steps: last.steps - first.steps, keep: 6, ..*last };
+            self.phases.insert(self.phases.len() - 1, first);
+        }
+        self
+    }
 }
 
 /// Where one start ended.
@@ -324,6 +335,9 @@ mod tests {
         for (phase, before) in faster.phases.iter().zip(&culled.phases) {
             assert!((phase.learning_rate.1 - 2.0 * before.learning_rate.1).abs() < 1e-15);
         }
+        let keeps = |options: &Options| options.phases.iter().map(|phase| (phase.steps, phase.keep)).collect::<Vec<_>>();
+        assert_eq!(keeps(&Options::paper().with_culling()), [(60, usize::MAX), (240, 6)]);
+        assert_eq!(culled.clone().with_culling(), culled);
         assert!(culled.with_stride(1).without_culling().phases.iter().all(|phase| (phase.stride, phase.keep) == (1, usize::MAX)));
     }
 }
