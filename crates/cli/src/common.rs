@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use glam::DMat4;
+use image::{Rgb, RgbImage};
 use indicatif::{ProgressBar, ProgressStyle};
 use sigma_srn::{Engine, Gpu, Intrinsics};
 use srn_data::{Dataset, LoadedView, SrnSet};
@@ -59,6 +60,18 @@ impl EngineArgs {
             Some(bytes) => engine.with_budget(bytes),
             None => engine,
         })
+    }
+
+    /// The same, but what no flag says is as in an earlier call: the executor by its name, and the memory budget, since both
+    /// decide the order of sums.
+    pub fn open_like(&self, executor: &str, memory: u64) -> Result<Engine> {
+        let mut like = EngineArgs { memory: self.memory.or(Some(memory)), ..self.clone() };
+        match (self.executor, &self.adapter) {
+            (Executor::Auto, None) if executor == Engine::cpu().to_string() => like.executor = Executor::Cpu,
+            (Executor::Auto, None) => like.adapter = Some(executor.into()),
+            _ => {}
+        }
+        like.open()
     }
 }
 
@@ -113,6 +126,13 @@ pub fn camera(view: &LoadedView) -> (DMat4, Intrinsics) {
     let [fx, fy, cx, cy] = view.intrinsics.map(f64::from);
     let world_from_camera = DMat4::from_cols_array(&view.world_from_camera).transpose();
     (world_from_camera, Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 })
+}
+
+/// A picture of depths: the nearer the lighter, from 0.6 object units before the origin to 0.6 behind it, for a camera that is
+/// `distance` away from it.
+pub fn depth_picture(depth: &[f32], side: u32, distance: f64) -> RgbImage {
+    let shade = |z: f32| (0.5 - (f64::from(z) - distance) / 1.2).clamp(0.0, 1.0) * 255.0;
+    RgbImage::from_fn(side, side, |u, v| Rgb([shade(depth[(v * side + u) as usize]).round() as u8; 3]))
 }
 
 /// Peak signal-to-noise ratio in dB of colours in [-1, 1], the rendered ones clamped to that range as a picture would be.

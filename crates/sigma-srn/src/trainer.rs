@@ -183,10 +183,13 @@ impl Trainer {
         &mut *self.runner
     }
 
-    /// Reads the parameters back and returns the model.
+    /// Reads the parameters back and returns the model. Fails where one is not finite, so that no such model is ever saved.
     pub fn model(&mut self) -> Result<&Model, Error> {
         for (&buffer, parameter) in self.handles.network.parameters.iter().zip(&mut self.model.parameters) {
             parameter.values = self.runner.read(buffer)?;
+            if !parameter.values.iter().all(|value| value.is_finite()) {
+                return Err(Error::Diverged { step: self.steps });
+            }
         }
         Ok(&self.model)
     }

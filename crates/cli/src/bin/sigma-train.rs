@@ -1,0 +1,29 @@
+//! `sigma-train`: trains σSRN models on SRN data sets, and fits trained ones to new instances.
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use sigma_cli::common;
+use sigma_cli::train::fit;
+
+/// Trains σSRN models on SRN data sets.
+///
+/// Results go to stdout, progress to stderr. Exit status: 0 done, 1 stopped before the end, 2 error.
+#[derive(Parser)]
+#[command(version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Train a model from nothing, or go on with a run that was stopped.
+    Fit(fit::FitArgs),
+}
+
+fn main() -> ExitCode {
+    common::finish(match Cli::parse().command {
+        Command::Fit(args) => fit::fit(&args),
+    })
+}

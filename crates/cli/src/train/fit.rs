@@ -1,0 +1,360 @@
+//! `sigma-train fit`: a run, its folder, and how it goes on after a stop.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use image::RgbImage;
+use indicatif::{HumanDuration, ProgressBar};
+use rand::RngExt;
+use serde::{Deserialize, Serialize};
+use sigma_srn::{Engine, Losses, Metadata, Model, Train, Trainer, stream, write_atomically};
+use srn_data::{Dataset, SrnSet, pixels, sheet};
+
+use super::{Changeable, ForGood, Settings, Shown, render, training_batch};
+use crate::common::{self, EngineArgs, Result};
+
+/// Time between checkpoints.
+const CHECKPOINT_INTERVAL: Duration = Duration::from_secs(60);
+/// Time between lines of progress where stderr is no terminal.
+const LINE_INTERVAL: Duration = Duration::from_secs(30);
+
+/// Flags of `sigma-train fit`.
+#[derive(Args, Debug)]
+pub struct FitArgs {
+    /// Folder of the run, made here: model, checkpoint, metrics, sample images.
+    #[arg(long, value_name = "RUN", required_unless_present = "resume")]
+    out: Option<PathBuf>,
+    /// Go on with the run in this folder, with its own settings and to the same numbers.
+    #[arg(long, value_name = "RUN", conflicts_with = "out")]
+    resume: Option<PathBuf>,
+    #[command(flatten)]
+    changeable: Changeable,
+    #[command(flatten)]
+    for_good: ForGood,
+    #[command(flatten)]
+    engine: EngineArgs,
+    /// Print the result as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Trains; false if it was stopped before the end.
+pub fn fit(args: &FitArgs) -> Result<bool> {
+    let is_resumed = args.resume.is_some();
+    let run = args.resume.as_ref().or(args.out.as_ref()).ok_or("--out or --resume is needed")?;
+    let (mut settings, engine) = if is_resumed {
+        let mut settings = Settings::read(run)?;
+        settings.change(&args.changeable);
+        let engine = args.engine.open_like(&settings.executor, settings.memory)?;
+        (settings, engine)
+    } else {
+        if fs::read_dir(run).is_ok_and(|mut files| files.next().is_some()) {
+            return Err(format!("{}: not empty, nothing was overwritten; --resume goes on with a run", run.display()).into());
+        }
+        (Settings::new(&args.for_good, &args.changeable)?, args.engine.open()?)
+    };
+    let set = load(&settings.data, settings.side, settings.views)?;
+    let instances: BTreeMap<_, _> = set.instances.iter().map(|i| (i.name.clone(), i.views.len())).collect();
+    if is_resumed && instances != settings.instances {
+        let what = "other instances or numbers of views than this run began with";
+        return Err(format!("{}: {what}", settings.data.display()).into());
+    }
+    settings.instances = instances;
+    (settings.executor, settings.memory) = (engine.to_string(), engine.budget());
+    let validation = settings.validation.as_ref().map(|dir| load(dir, settings.side, None)).transpose()?;
+    let watched = watched_views(&set, validation.as_ref(), settings.validation_views as usize)?;
+
+    let mut model = Model::init(&settings.model(), settings.seed)?;
+    let instance_names = settings.instances.keys().cloned().collect();
+    let orbit_radius = median_distance(&set);
+    model.metadata = Metadata { instance_names, side: Some(settings.side), orbit_radius: Some(orbit_radius) };
+    let mut trainer = Trainer::new(&engine, model, Train::Everything, settings.batch, settings.rays)?;
+    let samples = run.join("samples");
+    fs::create_dir_all(&samples).map_err(|error| format!("{}: {error}", samples.display()))?;
+    let checkpoint = run.join("checkpoint.safetensors");
+    // A run that was killed before its first checkpoint begins again.
+    if is_resumed && checkpoint.exists() {
+        trainer.load_checkpoint(&checkpoint)?;
+    }
+    if trainer.steps() > settings.steps {
+        return Err(format!("--steps {}: the run has done {} already", settings.steps, trainer.steps()).into());
+    }
+    settings.write(run)?;
+    let mut metrics = Metrics::open(run.join("metrics.jsonl"), trainer.steps())?;
+
+    let stop = stop_on_signal()?;
+    let mut meter = Meter::new(&settings, trainer.steps(), metrics.last().map_or(0.0, |record| record.seconds));
+    let mut checkpointed = Instant::now();
+    while trainer.steps() < settings.steps && !stop.load(Ordering::SeqCst) {
+        let step = trainer.steps() + 1;
+        let learning_rate = settings.learning_rate(step);
+        // Everything random comes from seed and step: a resumed run needs no memory of it.
+        let mut random = stream(settings.seed, step);
+        let views: Vec<Shown> = (0..settings.batch)
+            .map(|_| {
+                let instance = random.random_range(0..set.instances.len());
+                let views = &set.instances[instance].views;
+                (instance as u32, &views[random.random_range(0..views.len())])
+            })
+            .collect();
+        trainer.step(&training_batch(&views, settings.side, settings.rays, &mut random), learning_rate)?;
+        meter.bar.inc(1);
+
+        let is_due = |every: u64| step.is_multiple_of(every) || step == settings.steps;
+        if is_due(settings.log_every) || is_due(settings.validate_every) {
+            let losses = trainer.losses()?;
+            let mut record = Record::new(step, &losses, learning_rate, meter.seconds());
+            let rays_per_second = meter.rays_per_second(step);
+            if is_due(settings.validate_every) {
+                let (psnr, picture) = look(&engine, trainer.model()?, &watched, settings.side, orbit_radius)?;
+                let path = samples.join(format!("step_{step:06}.png"));
+                picture.save(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+                record.validation_psnr = Some(psnr);
+            }
+            metrics.push(record)?;
+            meter.show(step, &losses, rays_per_second, metrics.validation_psnr());
+        }
+        if checkpointed.elapsed() > CHECKPOINT_INTERVAL || settings.checkpoint_every.is_some_and(is_due) {
+            save_checkpoint(&mut trainer, &metrics, &checkpoint)?;
+            checkpointed = Instant::now();
+        }
+    }
+    meter.bar.finish_and_clear();
+    save_checkpoint(&mut trainer, &metrics, &checkpoint)?;
+    if trainer.steps() < settings.steps {
+        eprintln!("stopped after step {}; to go on: sigma-train fit --resume {}", trainer.steps(), run.display());
+        return Ok(false);
+    }
+
+    let model = run.join("model.safetensors");
+    trainer.model()?.save(&model)?;
+    let curves = run.join("curves.png");
+    metrics.curves().save(&curves).map_err(|error| format!("{}: {error}", curves.display()))?;
+    let last = metrics.last().ok_or("no step was done")?;
+    if args.json {
+        let result = serde_json::json!({ "model": model, "unseen_views": validation.is_some(), "last": last });
+        println!("{result:#}");
+    } else {
+        let which = if validation.is_some() { "unseen" } else { "training" };
+        let psnr = last.validation_psnr.unwrap_or(f64::NAN);
+        println!("PSNR {psnr:.2} dB on {} {which} views after {} steps", watched.len(), last.step);
+        println!("model: {}", model.display());
+    }
+    Ok(true)
+}
+
+/// Reads a set, the first `views` of each instance.
+fn load(dir: &Path, side: u32, views: Option<usize>) -> Result<Dataset> {
+    let mut set = SrnSet::open(dir)?;
+    for instance in &mut set.instances {
+        instance.views.truncate(views.unwrap_or(usize::MAX));
+    }
+    Ok(set.load(side as usize)?)
+}
+
+/// The views of a validation: from every instance in turn, spread over its views.
+fn watched_views<'a>(set: &'a Dataset, validation: Option<&'a Dataset>, count: usize) -> Result<Vec<Shown<'a>>> {
+    let from = validation.unwrap_or(set);
+    let number = |name: &str| set.instances.iter().position(|known| known.name == name);
+    (0..count)
+        .map(|k| {
+            let instance = &from.instances[k % from.instances.len()];
+            let number = number(&instance.name)
+                .ok_or_else(|| format!("--validation: instance `{}` is not in the training set", instance.name))?;
+            Ok((number as u32, &instance.views[k * instance.views.len() / count]))
+        })
+        .collect()
+}
+
+/// Median distance of the cameras to the origin.
+fn median_distance(set: &Dataset) -> f64 {
+    let cameras = set.instances.iter().flat_map(|instance| &instance.views).map(common::camera);
+    let mut distances: Vec<f64> = cameras.map(|(pose, _)| pose.w_axis.truncate().length()).collect();
+    distances.sort_by(f64::total_cmp);
+    distances[distances.len() / 2]
+}
+
+/// Mean PSNR over the views, and a picture of them: target, rendering and depth side by side.
+fn look(engine: &Engine, model: &Model, views: &[Shown], side: u32, distance: f64) -> Result<(f64, RgbImage)> {
+    let rendering = render(engine, model, views, side)?;
+    let pixels = (side * side) as usize;
+    let mut cells = vec![];
+    let mut sum = 0.0;
+    for ((&(instance, view), rgb), depth) in
+        views.iter().zip(rendering.rgb.chunks(3 * pixels)).zip(rendering.depth.chunks(pixels))
+    {
+        let psnr = common::psnr(rgb, &view.rgb);
+        sum += psnr;
+        let picture = |rgb| pixels::rgb8(rgb, side as usize, side as usize);
+        cells.push((picture(&view.rgb), model.instance_name(instance)));
+        cells.push((picture(rgb), format!("{psnr:.1} dB")));
+        cells.push((common::depth_picture(depth, side, distance), "depth".into()));
+    }
+    // Large enough for the labels.
+    let factor = 96u32.div_ceil(side);
+    let cells: Vec<_> = cells.iter().map(|(picture, label)| (sheet::enlarge(picture, factor), label.as_str())).collect();
+    let cells: Vec<_> = cells.iter().map(|(picture, label)| (picture, *label)).collect();
+    Ok((sum / views.len() as f64, sheet::grid(&cells, 6)))
+}
+
+/// Metrics first: a checkpoint's steps must all be in them.
+fn save_checkpoint(trainer: &mut Trainer, metrics: &Metrics, path: &Path) -> Result<()> {
+    metrics.sync()?;
+    Ok(trainer.save_checkpoint(path)?)
+}
+
+/// A flag that Ctrl-C raises; the second one ends the process at once.
+fn stop_on_signal() -> Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let raised = stop.clone();
+    ctrlc::set_handler(move || {
+        if raised.swap(true, Ordering::SeqCst) {
+            std::process::exit(1);
+        }
+    })?;
+    Ok(stop)
+}
+
+/// A line of `metrics.jsonl`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Record {
+    step: u64,
+    /// The weighted sum of the three terms that follow, on the step's batch.
+    loss: f64,
+    image: f64,
+    latent: f64,
+    depth: f64,
+    psnr: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    validation_psnr: Option<f64>,
+    learning_rate: f64,
+    /// Time since the beginning, without the time between the parts of a run.
+    seconds: f64,
+}
+
+impl Record {
+    fn new(step: u64, losses: &Losses, learning_rate: f64, seconds: f64) -> Self {
+        let Losses { image, latent, depth } = *losses;
+        let (loss, psnr) = (losses.total(), losses.psnr());
+        Record { step, loss, image, latent, depth, psnr, validation_psnr: None, learning_rate, seconds }
+    }
+}
+
+/// `metrics.jsonl`, on disk and in memory.
+struct Metrics {
+    path: PathBuf,
+    file: File,
+    records: Vec<Record>,
+}
+
+impl Metrics {
+    /// Opens or makes the file; lines behind `step`, and one cut short by a crash, are dropped.
+    fn open(path: PathBuf, step: u64) -> Result<Self> {
+        let text = fs::read_to_string(&path).unwrap_or_default();
+        let records = text.lines().filter_map(|line| serde_json::from_str(line).ok());
+        let records: Vec<Record> = records.filter(|record: &Record| record.step <= step).collect();
+        let lines = records.iter().map(|record| Ok(serde_json::to_string(record)? + "\n")).collect::<Result<String>>()?;
+        write_atomically(&path, lines.as_bytes())?;
+        let file = OpenOptions::new().append(true).open(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+        Ok(Metrics { path, file, records })
+    }
+
+    fn push(&mut self, record: Record) -> Result<()> {
+        let line = serde_json::to_string(&record)? + "\n";
+        self.file.write_all(line.as_bytes()).map_err(|error| format!("{}: {error}", self.path.display()))?;
+        self.records.push(record);
+        Ok(())
+    }
+
+    fn sync(&self) -> Result<()> {
+        self.file.sync_data().map_err(|error| format!("{}: {error}", self.path.display()).into())
+    }
+
+    fn last(&self) -> Option<&Record> {
+        self.records.last()
+    }
+
+    /// The latest there is.
+    fn validation_psnr(&self) -> Option<f64> {
+        self.records.iter().rev().find_map(|record| record.validation_psnr)
+    }
+
+    /// Loss and PSNR over the steps.
+    fn curves(&self) -> RgbImage {
+        let points = |value: &dyn Fn(&Record) -> Option<f64>| -> Vec<(f64, f64)> {
+            self.records.iter().filter_map(|record| Some((record.step as f64, value(record)?))).collect()
+        };
+        let curve = |label, points, number: usize| sheet::Curve { label, points, colour: sheet::CURVES[number] };
+        let loss = points(&|record| Some(record.loss));
+        let [training, validation] = [points(&|record| Some(record.psnr)), points(&|record| record.validation_psnr)];
+        let size = [800, 400];
+        let loss = sheet::plot_curve("loss", &[curve("", &loss, 0)], size, true);
+        let psnr = [curve("training batch", &training, 0), curve("validation", &validation, 1)];
+        sheet::grid(&[(&loss, ""), (&sheet::plot_curve("PSNR (dB)", &psnr, size, false), "")], 1)
+    }
+}
+
+/// Progress on stderr: a bar, or a line now and then where stderr is no terminal.
+struct Meter {
+    bar: ProgressBar,
+    steps: u64,
+    rays_per_step: u64,
+    first_step: u64,
+    start: Instant,
+    seconds_before: f64,
+    /// Step and time from which the speed is measured.
+    since: (u64, Instant),
+    last_line: Option<Instant>,
+    /// Mean of the image loss over about the last ten readings.
+    image_loss: Option<f64>,
+}
+
+impl Meter {
+    fn new(settings: &Settings, step: u64, seconds_before: f64) -> Self {
+        let bar = common::progress(settings.steps, "training").with_position(step);
+        bar.reset_eta();
+        let now = Instant::now();
+        Meter {
+            bar,
+            steps: settings.steps,
+            rays_per_step: u64::from(settings.batch) * u64::from(settings.rays),
+            first_step: step,
+            start: now,
+            seconds_before,
+            since: (step, now),
+            last_line: None,
+            image_loss: None,
+        }
+    }
+
+    /// Time of training up to now, over all parts of the run.
+    fn seconds(&self) -> f64 {
+        self.seconds_before + self.start.elapsed().as_secs_f64()
+    }
+
+    /// Rays per second since the last call of [`Meter::show`].
+    fn rays_per_second(&self, step: u64) -> f64 {
+        ((step - self.since.0) * self.rays_per_step) as f64 / self.since.1.elapsed().as_secs_f64()
+    }
+
+    fn show(&mut self, step: u64, losses: &Losses, rays_per_second: f64, validation_psnr: Option<f64>) {
+        let image = self.image_loss.map_or(losses.image, |mean| 0.9 * mean + 0.1 * losses.image);
+        self.image_loss = Some(image);
+        let psnr = Losses { image, ..*losses }.psnr();
+        let validation = validation_psnr.map_or(String::new(), |psnr| format!(", validation {psnr:.2} dB"));
+        let message = format!("loss {:.3}, PSNR {psnr:.2} dB{validation}, {rays_per_second:.0} rays/s", losses.total());
+        if self.bar.is_hidden() && (self.last_line.is_none_or(|at| at.elapsed() > LINE_INTERVAL) || step == self.steps) {
+            let left = self.start.elapsed().mul_f64((self.steps - step) as f64 / (step - self.first_step) as f64);
+            eprintln!("step {step}/{}: {message}, {} left", self.steps, HumanDuration(left));
+            self.last_line = Some(Instant::now());
+        }
+        self.bar.set_message(message);
+        self.since = (step, Instant::now());
+    }
+}

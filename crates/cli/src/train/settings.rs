@@ -1,0 +1,235 @@
+//! Settings of a training run: presets, flags over them, and the `config.json` that a run keeps.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use serde::{Deserialize, Serialize};
+use sigma_srn::{ModelConfig, write_atomically};
+
+use crate::common::Result;
+
+/// Everything that decides the numbers of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Settings {
+    /// Training set: a folder of SRN instance folders.
+    pub data: PathBuf,
+    /// Set of unseen views of the same instances; training views are looked at where there is none.
+    pub validation: Option<PathBuf>,
+    /// Name and number of views of each instance, so that a resumed run notices another set.
+    pub instances: BTreeMap<String, usize>,
+    /// Features of the networks.
+    pub hidden: u32,
+    /// Length of a latent code.
+    pub latent: u32,
+    /// Marching steps M.
+    pub tracing_steps: u32,
+    /// False: plain SRN, without the density net.
+    pub density: bool,
+    /// Side of the images in pixels.
+    pub side: u32,
+    /// Views of an instance at most.
+    pub views: Option<usize>,
+    /// Images per step.
+    pub batch: u32,
+    /// Rays per image.
+    pub rays: u32,
+    /// Number of steps.
+    pub steps: u64,
+    /// Learning rate of Adam.
+    pub lr: f64,
+    /// Factor on the learning rate in the last part.
+    pub decay: f64,
+    /// The last step at the full learning rate.
+    pub decay_from: u64,
+    /// Decides everything random.
+    pub seed: u64,
+    /// Steps between lines of `metrics.jsonl`.
+    pub log_every: u64,
+    /// Steps between validations.
+    pub validate_every: u64,
+    /// Views of a validation.
+    pub validation_views: u32,
+    /// Steps between checkpoints; besides, there is one every minute.
+    pub checkpoint_every: Option<u64>,
+    /// The executor, and its memory budget in bytes: both decide the order of sums.
+    pub executor: String,
+    /// See `executor`.
+    pub memory: u64,
+}
+
+/// Starting points for the settings.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Preset {
+    /// Trains in under two hours on two CPU cores: small networks, random rays.
+    #[default]
+    Compact,
+    /// The paper's: 256 features, batches of 10 whole images at 5e-5, at most 50 views of an instance.
+    Paper,
+}
+
+/// Flags that a run keeps for good.
+#[derive(Args, Clone, Debug)]
+#[group(conflicts_with = "resume")]
+pub struct ForGood {
+    /// Starting point for all numbers.
+    #[arg(long, value_enum)]
+    preset: Option<Preset>,
+    /// Features of the networks [compact 64, paper 256].
+    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    hidden: Option<u32>,
+    /// Length of a latent code [compact 32, paper 256].
+    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    latent: Option<u32>,
+    /// Marching steps along a ray [10].
+    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    tracing_steps: Option<u32>,
+    /// Plain SRN, the baseline: no density net, the colour comes from the end point alone.
+    #[arg(long)]
+    plain_srn: bool,
+    /// Images are cut to squares and resampled to this side, in pixels [64].
+    #[arg(long, value_name = "PIXELS", value_parser = at_least_1())]
+    side: Option<u32>,
+    /// Use only the first views of each instance, this many [compact all, paper 50].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    views: Option<u32>,
+    /// Images per step [10].
+    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    batch: Option<u32>,
+    /// Random rays per image; side² takes whole images [compact 512, paper side²].
+    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    rays: Option<u32>,
+    /// Decides the first weights and every draw [0].
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Steps between lines of metrics.jsonl [50].
+    #[arg(long, value_name = "STEPS", value_parser = clap::value_parser!(u64).range(1..))]
+    log_every: Option<u64>,
+    /// Steps between validations with a sample image [500].
+    #[arg(long, value_name = "STEPS", value_parser = clap::value_parser!(u64).range(1..))]
+    validate_every: Option<u64>,
+    /// Views of a validation, spread over the set [16].
+    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    validation_views: Option<u32>,
+    /// Steps between checkpoints, besides one every minute.
+    #[arg(long, value_name = "STEPS", value_parser = clap::value_parser!(u64).range(1..))]
+    checkpoint_every: Option<u64>,
+}
+
+/// Flags that may change when a run is resumed.
+#[derive(Args, Clone, Debug)]
+pub struct Changeable {
+    /// Training set: a folder of SRN instance folders.
+    #[arg(long, value_name = "DIR", required_unless_present = "resume")]
+    data: Option<PathBuf>,
+    /// Unseen views of the same instances, for validation. Without it, training views are looked at.
+    #[arg(long, value_name = "DIR")]
+    validation: Option<PathBuf>,
+    /// Number of steps [compact 12000, paper 100000].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    steps: Option<u64>,
+    /// Learning rate of Adam [compact 5e-4, paper 5e-5].
+    #[arg(long, value_name = "RATE", value_parser = positive)]
+    lr: Option<f64>,
+    /// Factor on the learning rate in the last part [compact 0.1, paper 1].
+    #[arg(long, value_name = "FACTOR", value_parser = positive)]
+    decay: Option<f64>,
+    /// The last step at the full learning rate [4/5 of the steps; a resumed run keeps it].
+    #[arg(long, value_name = "STEP")]
+    decay_from: Option<u64>,
+}
+
+fn at_least_1() -> clap::builder::RangedI64ValueParser<u32> {
+    clap::value_parser!(u32).range(1..)
+}
+
+pub(super) fn positive(text: &str) -> std::result::Result<f64, String> {
+    match text.parse() {
+        Ok(value) if 0.0 < value && value < f64::INFINITY => Ok(value),
+        _ => Err("expected a positive number".into()),
+    }
+}
+
+/// Overwrites the fields for which a flag was given.
+macro_rules! take {
+    ($settings:ident, $flags:ident: $($field:ident),*) => {
+        $(if let Some(value) = $flags.$field.clone() { $settings.$field = value.into(); })*
+    };
+}
+
+impl Settings {
+    /// Settings of a new run: the preset's, with the flags over them. The data set and the executor are not looked at yet.
+    pub fn new(for_good: &ForGood, changeable: &Changeable) -> Result<Self> {
+        let is_paper = for_good.preset == Some(Preset::Paper);
+        let mut settings = Settings {
+            data: PathBuf::new(),
+            validation: None,
+            instances: BTreeMap::new(),
+            hidden: if is_paper { 256 } else { 64 },
+            latent: if is_paper { 256 } else { 32 },
+            tracing_steps: 10,
+            density: !for_good.plain_srn,
+            side: 64,
+            views: is_paper.then_some(50),
+            batch: 10,
+            rays: 0,
+            steps: if is_paper { 100_000 } else { 12_000 },
+            lr: if is_paper { 5e-5 } else { 5e-4 },
+            decay: if is_paper { 1.0 } else { 0.1 },
+            decay_from: 0,
+            seed: 0,
+            log_every: 50,
+            validate_every: 500,
+            validation_views: 16,
+            checkpoint_every: None,
+            executor: String::new(),
+            memory: 0,
+        };
+        take!(settings, for_good: hidden, latent, tracing_steps, side, batch, seed);
+        take!(settings, for_good: log_every, validate_every, validation_views);
+        settings.views = for_good.views.map(|views| views as usize).or(settings.views);
+        settings.checkpoint_every = for_good.checkpoint_every;
+        let pixels = settings.side.saturating_mul(settings.side);
+        settings.rays = for_good.rays.unwrap_or(if is_paper { pixels } else { 512.min(pixels) });
+        if settings.rays > pixels {
+            return Err(format!("--rays {}: an image of side {} has {pixels} pixels", settings.rays, settings.side).into());
+        }
+        settings.change(changeable);
+        settings.decay_from = changeable.decay_from.unwrap_or(settings.steps * 4 / 5);
+        Ok(settings)
+    }
+
+    /// Takes the flags that were given.
+    pub fn change(&mut self, flags: &Changeable) {
+        take!(self, flags: data, validation, steps, lr, decay, decay_from);
+    }
+
+    /// Reads the `config.json` of a run.
+    pub fn read(run: &Path) -> Result<Self> {
+        let path = run.join("config.json");
+        let text = std::fs::read_to_string(&path).map_err(|error| format!("{}: {error}; no run to resume", path.display()))?;
+        serde_json::from_str(&text).map_err(|error| format!("{}: {error}", path.display()).into())
+    }
+
+    /// Writes the `config.json` of a run.
+    pub fn write(&self, run: &Path) -> Result<()> {
+        Ok(write_atomically(&run.join("config.json"), (serde_json::to_string_pretty(self)? + "\n").as_bytes())?)
+    }
+
+    /// Learning rate of a step, counted from 1.
+    pub fn learning_rate(&self, step: u64) -> f64 {
+        if step > self.decay_from { self.lr * self.decay } else { self.lr }
+    }
+
+    /// Sizes of the model.
+    pub fn model(&self) -> ModelConfig {
+        ModelConfig {
+            hidden: self.hidden,
+            latent: self.latent,
+            instances: self.instances.len() as u32,
+            tracing_steps: self.tracing_steps,
+            density: self.density,
+        }
+    }
+}
