@@ -22,13 +22,20 @@ pub trait Real: Float + AddAssign + Sum + Default + Send + Sync + std::fmt::Debu
         Self::one() / (Self::one() + (-self).exponential())
     }
 
-    /// `tanh x`, exact to a few units in the last place of 1.
+    /// `tanh x`: a polynomial near zero (Cephes), where the quotient of exponentials would cancel.
     #[inline(always)]
     fn hyperbolic_tangent(self) -> Self {
-        let limit = Self::of(20.0);
-        let e = if self > limit { limit } else { self };
-        let e = (e + e).exponential();
-        (e - Self::one()) / (e + Self::one())
+        let magnitude = self.abs();
+        let e = (magnitude + magnitude).exponential();
+        let far = (Self::one() - Self::of(2.0) / (e + Self::one())).copysign(self);
+        let square = self * self;
+        let p = Self::of(-5.704_988_727_455_282e-3);
+        let p = p * square + Self::of(2.063_908_879_545_3e-2);
+        let p = p * square + Self::of(-5.373_971_297_310_02e-2);
+        let p = p * square + Self::of(1.333_144_197_585_25e-1);
+        let p = p * square + Self::of(-3.333_328_194_227_63e-1);
+        let near = self + self * square * p;
+        if magnitude < Self::of(0.625) { near } else { far }
     }
 }
 
@@ -45,6 +52,9 @@ impl Real for f64 {
     }
     fn exponential(self) -> Self {
         self.exp()
+    }
+    fn hyperbolic_tangent(self) -> Self {
+        self.tanh()
     }
 }
 
@@ -77,8 +87,7 @@ impl Real for f32 {
         let p = p * r + 1.0 / 24.0;
         let p = p * r + 1.0 / 6.0;
         let p = p * r + 0.5;
-        let p = p * r + 1.0;
-        let p = p * r + 1.0;
+        let p = 1.0 + (r + r * r * p);
         // The low bits of `shifted` are n: no conversion to an integer is needed.
         p * f32::from_bits(shifted.to_bits().wrapping_add(127) << 23)
     }
@@ -99,9 +108,12 @@ mod tests {
                 worst[0] = worst[0].max(relative(x.exponential(), exact.exp()));
                 worst[1] = worst[1].max(relative(x.sigmoid(), 1.0 / (1.0 + (-exact).exp())));
             }
-            worst[2] = worst[2].max((f64::from(x.hyperbolic_tangent()) - exact.tanh()).abs());
+            if x != 0.0 {
+                worst[2] = worst[2].max(((f64::from(x.hyperbolic_tangent()) - exact.tanh()) / exact.tanh()).abs());
+            }
         }
         // Measured: 1.6e-7, 2.4e-7, 1.2e-7.
+        println!("{worst:?}");
         assert!(worst[0] < 4e-7 && worst[1] < 6e-7 && worst[2] < 3e-7, "{worst:?}");
         assert!(f32::NAN.sigmoid().is_nan() && f32::NAN.hyperbolic_tangent().is_nan(), "NaN must not be hidden");
     }

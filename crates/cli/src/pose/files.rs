@@ -1,0 +1,185 @@
+//! What `sigma-pose` reads and writes: models, pictures with their cameras, PNG and GIF.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use glam::DMat4;
+use image::codecs::gif::{GifEncoder, Repeat};
+use image::{Delay, Frame, ImageFormat, RgbImage};
+use sigma_srn::{Intrinsics, Model, write_atomically};
+use srn_data::srn::{self, load_square};
+
+use super::positive;
+use crate::common::Result;
+
+/// Reads a model; every error names the file.
+pub fn load_model(path: &Path) -> Result<Model> {
+    Model::load(path).map_err(|error| match error {
+        sigma_srn::Error::MissingTensor { .. } | sigma_srn::Error::Tensor { .. } => {
+            format!("{}: {error}", path.display()).into()
+        }
+        error => error.into(),
+    })
+}
+
+/// Flags that describe the camera; at most one of them.
+#[derive(Args, Clone, Debug)]
+#[group(multiple = false)]
+pub struct CameraArgs {
+    /// File with `f cx cy 0.`, `0. 0. 0.`, `1.` and `height width` (SRN's intrinsics.txt).
+    #[arg(long, value_name = "FILE")]
+    intrinsics: Option<PathBuf>,
+    /// Focal length in pixels of the picture; the principal point is its middle.
+    #[arg(long, value_name = "PX", value_parser = positive)]
+    focal: Option<f64>,
+    /// Angle of view across the picture's width in degrees, instead of --focal.
+    #[arg(long, value_name = "DEG", value_parser = angle_of_view)]
+    fov: Option<f64>,
+}
+
+fn angle_of_view(text: &str) -> std::result::Result<f64, String> {
+    positive(text).ok().filter(|&degrees| degrees < 180.0).ok_or("expected a number between 0 and 180".into())
+}
+
+impl CameraArgs {
+    /// What the flags say about a picture of `size` pixels, width then height; `None` where there is no flag.
+    pub fn intrinsics(&self, size: [usize; 2]) -> Result<Option<srn::Intrinsics>> {
+        if let Some(path) = &self.intrinsics {
+            return Ok(Some(srn::Intrinsics::read(path)?));
+        }
+        let [width, height] = size.map(|side| side as f64);
+        let focal = self.focal.or_else(|| self.fov.map(|degrees| 0.5 * width / (0.5 * degrees.to_radians()).tan()));
+        Ok(focal.map(|focal| srn::Intrinsics { focal, centre: [width / 2.0, height / 2.0], size }))
+    }
+}
+
+/// A pose file, or the one that belongs to a picture in an SRN folder.
+#[derive(Clone, Debug)]
+pub enum PoseSource {
+    /// `../pose/NAME.txt` of `rgb/NAME.png`.
+    Auto,
+    /// This file.
+    File(PathBuf),
+}
+
+impl From<&str> for PoseSource {
+    fn from(text: &str) -> Self {
+        if text == "auto" { PoseSource::Auto } else { PoseSource::File(text.into()) }
+    }
+}
+
+impl PoseSource {
+    /// Reads the pose for a picture.
+    pub fn read(&self, picture: &Path) -> Result<DMat4> {
+        let path = match self {
+            PoseSource::File(path) => path.clone(),
+            PoseSource::Auto => {
+                let name = picture.with_extension("txt");
+                let dir = srn_instance(picture).ok_or_else(|| {
+                    format!("{}: its pose is found only in an SRN folder (INSTANCE/rgb, INSTANCE/pose)", picture.display())
+                })?;
+                dir.join("pose").join(name.file_name().unwrap_or_default())
+            }
+        };
+        Ok(srn::read_pose(&path)?)
+    }
+}
+
+/// The instance folder of a picture `INSTANCE/rgb/NAME.png`.
+fn srn_instance(picture: &Path) -> Option<PathBuf> {
+    let path = std::fs::canonicalize(picture).ok()?;
+    let folder = path.parent()?;
+    let is_rgb = folder.file_name()? == "rgb";
+    folder.parent().filter(|_| is_rgb).map(PathBuf::from)
+}
+
+/// A picture as the model takes it.
+#[derive(Clone, Debug)]
+pub struct Picture {
+    /// Short name, unique among the pictures of a run.
+    pub name: String,
+    /// Number of the instance that it shows.
+    pub instance: u32,
+    /// Colours in [-1, 1], `[side, side, 3]`.
+    pub rgb: Vec<f32>,
+    /// Intrinsics of the resampled picture.
+    pub intrinsics: Intrinsics,
+    /// Its true `world_from_camera`, if known.
+    pub truth: Option<DMat4>,
+}
+
+impl Picture {
+    /// Reads a picture as a square of `side` pixels. In an SRN folder the intrinsics and the instance's name are found beside it.
+    pub fn open(path: &Path, model: &Model, side: u32, instance: Option<&str>, camera: &CameraArgs) -> Result<Self> {
+        let about = |what: &str| format!("{}: {what}", path.display());
+        let dir = srn_instance(path);
+        let size = size_of(path)?;
+        let beside = dir.as_ref().map(|dir| dir.join("intrinsics.txt")).filter(|file| file.exists());
+        let intrinsics = match (camera.intrinsics(size)?, beside) {
+            (Some(given), _) => given,
+            (None, Some(file)) => srn::Intrinsics::read(&file)?,
+            (None, None) => return Err(about("no intrinsics: give --focal, --fov or --intrinsics").into()),
+        };
+        let folder = dir.as_deref().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
+        let instance = instance.map(String::from).or(folder).ok_or_else(|| about("which object is it? Give --instance"))?;
+        let instance = model.instance(&instance)?;
+        let (pixels, [fx, fy, cx, cy]) = load_square(path, &intrinsics, side as usize)?;
+        let [fx, fy, cx, cy] = [fx, fy, cx, cy].map(f64::from);
+        let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+        Ok(Picture {
+            name: format!("{}-{stem}", model.instance_name(instance)),
+            instance,
+            rgb: pixels.data,
+            intrinsics: Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 },
+            truth: None,
+        })
+    }
+}
+
+/// Width and height of a picture.
+pub fn size_of(path: &Path) -> Result<[usize; 2]> {
+    let about = |error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
+    let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format).map_err(|e| about(&e))?;
+    let (width, height) = reader.into_dimensions().map_err(|e| about(&format!("not a readable image: {e}")))?;
+    Ok([width as usize, height as usize])
+}
+
+/// Fails if one of the files is there already.
+pub fn refuse_existing(paths: impl IntoIterator<Item = PathBuf>, force: bool) -> Result<()> {
+    match paths.into_iter().find(|path| !force && path.exists()) {
+        Some(path) => Err(format!("{}: exists already; --force overwrites it", path.display()).into()),
+        None => Ok(()),
+    }
+}
+
+/// Makes a folder with its parents.
+pub fn create_dir(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).map_err(|error| format!("{}: {error}", path.display()).into())
+}
+
+/// Writes a picture as PNG, whole or not at all.
+pub fn write_png(path: &Path, picture: &RgbImage) -> Result<()> {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, ImageFormat::Png)?;
+    Ok(write_atomically(path, bytes.get_ref())?)
+}
+
+/// Writes an endless animation; each frame with the seconds that it stays.
+pub fn write_gif(path: &Path, frames: impl IntoIterator<Item = (RgbImage, f64)>) -> Result<()> {
+    let mut bytes = Vec::new();
+    let mut encoder = GifEncoder::new_with_speed(&mut bytes, 10);
+    encoder.set_repeat(Repeat::Infinite)?;
+    for (picture, seconds) in frames {
+        let rgba = image::DynamicImage::from(picture).into_rgba8();
+        let delay = Delay::from_numer_denom_ms((1000.0 * seconds) as u32, 1);
+        encoder.encode_frame(Frame::from_parts(rgba, 0, 0, delay))?;
+    }
+    drop(encoder);
+    Ok(write_atomically(path, &bytes)?)
+}
+
+/// Prints a result on stdout; a full disk or a closed pipe is an error, not a panic.
+pub fn print(text: &str) -> Result<()> {
+    use std::io::Write;
+    writeln!(std::io::stdout(), "{text}").map_err(|error| format!("stdout: {error}").into())
+}

@@ -1,0 +1,16 @@
+//! `sigma-pose`: poses of pictures, the paper's protocol on a data set, novel views.
+
+mod draw;
+pub mod estimate;
+pub mod evaluate;
+mod files;
+pub mod render;
+mod search;
+
+/// A finite number above zero.
+fn positive(text: &str) -> std::result::Result<f64, String> {
+    match text.parse() {
+        Ok(x) if x > 0.0 && f64::is_finite(x) => Ok(x),
+        _ => Err("expected a number above 0".into()),
+    }
+}

@@ -1,0 +1,230 @@
+//! The search for poses: its flags, and what it found.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clap::{Args, ValueEnum};
+use glam::DMat4;
+use serde::Serialize;
+use sigma_srn::camera::{fixed24, neighbor4, pose_error};
+use sigma_srn::{Engine, Error, Estimate, Intrinsics, Loss, Model, Options, Progress, Query, Renderer, Rendering, estimate};
+
+use super::files::Picture;
+use super::positive;
+use crate::common::Result;
+
+/// An estimate has converged if its render leaves less than this part of the picture unexplained ([`Found::unexplained`]).
+const CONVERGED_BELOW: f64 = 0.5;
+/// Views that are rendered at once.
+const RENDER_BATCH: usize = 8;
+
+/// How poses are searched for: the same flags for a picture and for a data set.
+#[derive(Args, Clone, Debug)]
+#[command(next_help_heading = "Search")]
+pub struct SearchArgs {
+    /// `default`: all starts on few rays, then only the most promising on more; each ends at its best step. `paper`: 300 steps
+    /// of Adam at 0.1 for every start, on all pixels; the last step counts.
+    #[arg(long, value_enum, default_value_t = Preset::Default)]
+    preset: Preset,
+    /// How picture and render are compared. `gmsd` implies `--stride 1`.
+    #[arg(long, default_value = "mae", value_parser = PossibleValuesParser::new(LOSSES.map(|(name, _)| name)).map(loss))]
+    loss: Loss,
+    /// Steps in all; the phases of the preset keep their shares.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    steps: Option<u32>,
+    /// Learning rate of the first step; the later ones keep their proportion to it.
+    #[arg(long, value_name = "X", value_parser = positive)]
+    lr: Option<f64>,
+    /// Drop the less promising starts on the way: what the default preset does; the paper's goes on with 6 after a fifth.
+    #[arg(long, overrides_with = "no_cull")]
+    cull: bool,
+    /// Follow all starts to the end.
+    #[arg(long, overrides_with = "cull")]
+    no_cull: bool,
+    /// Compare every N-th pixel of every N-th row, in all phases. Default: the preset's.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    stride: Option<u32>,
+    /// Decides the random initial depths of the rays.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Distance of the starts of `fixed24` from the object's centre, in object units. Default: as the model was trained.
+    #[arg(long, value_name = "R", value_parser = positive)]
+    radius: Option<f64>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Preset {
+    Default,
+    Paper,
+}
+
+const LOSSES: [(&str, Loss); 5] =
+    [("mae", Loss::Mae), ("mse", Loss::Mse), ("norm_l1", Loss::NormL1), ("norm_l2", Loss::NormL2), ("gmsd", Loss::Gmsd)];
+
+fn loss(name: String) -> Loss {
+    LOSSES.into_iter().find(|(known, _)| *known == name).map_or(Loss::Mae, |(_, loss)| loss)
+}
+
+/// Where searches start.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Starts {
+    /// 8 azimuths × 3 elevations around the object.
+    Fixed24,
+    /// A rough pose, turned by 30° to four sides.
+    Neighbor4,
+    /// The poses in a file.
+    File(PathBuf),
+}
+
+impl From<&str> for Starts {
+    fn from(text: &str) -> Self {
+        match text {
+            "fixed24" => Starts::Fixed24,
+            "neighbor4" => Starts::Neighbor4,
+            path => Starts::File(path.into()),
+        }
+    }
+}
+
+impl SearchArgs {
+    /// The settings of the estimator.
+    pub fn options(&self) -> Options {
+        let mut options = match self.preset {
+            Preset::Default => Options::culled(),
+            Preset::Paper => Options::paper(),
+        };
+        if self.no_cull {
+            options = options.without_culling();
+        } else if self.cull {
+            options = options.with_culling();
+        }
+        if let Some(steps) = self.steps {
+            options = options.with_steps(steps);
+        }
+        if let Some(rate) = self.lr {
+            options = options.with_learning_rate(rate);
+        }
+        if let Some(stride) = self.stride.or((self.loss == Loss::Gmsd).then_some(1)) {
+            options = options.with_stride(stride);
+        }
+        Options { loss: self.loss, seed: self.seed, ..options }
+    }
+
+    /// The poses to start from; `rough` is the one that `neighbor4` turns.
+    pub fn starts(&self, starts: &Starts, model: &Model, rough: Option<&DMat4>) -> Result<Vec<DMat4>> {
+        match starts {
+            Starts::Fixed24 => {
+                let radius = self.radius.or(model.metadata.orbit_radius);
+                Ok(fixed24(radius.ok_or("the model does not say how far its cameras were: give --radius")?))
+            }
+            Starts::Neighbor4 => Ok(neighbor4(rough.ok_or("--starts neighbor4 turns a rough pose: give --rough")?)),
+            Starts::File(path) if !path.exists() => {
+                Err(format!("--starts {}: no such file; expected fixed24, neighbor4 or a file", path.display()).into())
+            }
+            Starts::File(path) => Ok(srn_data::srn::read_poses(path)?),
+        }
+    }
+}
+
+/// What a search found for one picture.
+#[derive(Clone, Debug)]
+pub struct Found {
+    /// The estimate with all starts ranked.
+    pub estimate: Estimate,
+    /// The pose.
+    pub world_from_camera: DMat4,
+    /// The model's view from there `[side, side, 3]`.
+    pub rgb: Vec<f32>,
+    /// The part of the picture that the render leaves unexplained: the sum of absolute differences to the render, over that to
+    /// an empty (white) picture. 0: equal; 1: no better than nothing.
+    pub unexplained: f64,
+    /// Seconds of the search, a picture's share of its batch.
+    pub seconds: f64,
+}
+
+/// Distance of a pose from the truth.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct PoseError {
+    /// Angle of the rotation between them, degrees.
+    pub rotation_deg: f64,
+    /// Distance of the camera centres, object units.
+    pub translation: f64,
+}
+
+impl PoseError {
+    /// Of `pose` against `truth`.
+    pub fn of(pose: &DMat4, truth: &DMat4) -> Self {
+        let (rotation_deg, translation) = pose_error(pose, truth);
+        PoseError { rotation_deg, translation }
+    }
+}
+
+impl std::fmt::Display for PoseError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:.2}° {:.3}", self.rotation_deg, self.translation)
+    }
+}
+
+impl Found {
+    /// Whether the estimate explains the picture; says nothing certain about objects that look alike from two sides.
+    pub fn converged(&self) -> bool {
+        self.world_from_camera.is_finite() && self.unexplained < CONVERGED_BELOW
+    }
+}
+
+/// Estimates the poses of `pictures`, all of `side` pixels, each from its own starts.
+pub fn search(
+    engine: &Engine,
+    model: &Model,
+    side: u32,
+    pictures: &[Picture],
+    starts: &[Vec<DMat4>],
+    options: &Options,
+    observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
+) -> Result<Vec<Found>> {
+    let query = |(picture, starts): (&Picture, &Vec<DMat4>)| Query {
+        instance: picture.instance,
+        rgb: picture.rgb.clone(),
+        width: side,
+        height: side,
+        intrinsics: picture.intrinsics,
+        starts: starts.clone(),
+    };
+    let queries: Vec<_> = pictures.iter().zip(starts).map(query).collect();
+    let began = Instant::now();
+    let estimates = estimate(engine, model, &queries, options, observe)?;
+    let seconds = began.elapsed().as_secs_f64() / pictures.len().max(1) as f64;
+
+    let views: Vec<View> =
+        pictures.iter().zip(&estimates).map(|(p, found)| (p.instance, found.pose.to_matrix(), p.intrinsics)).collect();
+    let renders = render(engine, model, side, &views)?;
+    let found = estimates.into_iter().zip(renders).zip(pictures).map(|((estimate, render), picture)| {
+        let sum = |of: &dyn Fn(usize) -> f32| (0..picture.rgb.len()).map(|i| f64::from(of(i).abs())).sum::<f64>();
+        let left = sum(&|i| picture.rgb[i] - render.rgb[i].clamp(-1.0, 1.0));
+        let unexplained = left / sum(&|i| picture.rgb[i] - 1.0);
+        Found { world_from_camera: estimate.pose.to_matrix(), estimate, rgb: render.rgb, unexplained, seconds }
+    });
+    Ok(found.collect())
+}
+
+/// Instance, `world_from_camera` and intrinsics of a view.
+pub type View = (u32, DMat4, Intrinsics);
+
+/// Renders views of `side` pixels, a few at a time.
+pub fn render(engine: &Engine, model: &Model, side: u32, views: &[View]) -> Result<Vec<Rendering>> {
+    let batch = views.len().min(RENDER_BATCH);
+    let mut renderer = Renderer::new(engine, model, batch as u32, side, side)?;
+    let mut renders = Vec::new();
+    for chunk in views.chunks(batch) {
+        // The renderer's size is fixed: the last batch is filled up with copies.
+        let filled: Vec<View> = chunk.iter().cycle().take(batch).copied().collect();
+        let instances: Vec<u32> = filled.iter().map(|view| view.0).collect();
+        let cameras: Vec<_> = filled.iter().map(|view| (view.1, view.2)).collect();
+        let Rendering { rgb, depth } = renderer.render(&instances, &cameras, 0)?;
+        let pixels = (side * side) as usize;
+        let each = rgb.chunks(3 * pixels).zip(depth.chunks(pixels)).take(chunk.len());
+        renders.extend(each.map(|(rgb, depth)| Rendering { rgb: rgb.to_vec(), depth: depth.to_vec() }));
+    }
+    Ok(renders)
+}
