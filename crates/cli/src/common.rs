@@ -10,7 +10,7 @@ use glam::DMat4;
 use image::{Rgb, RgbImage};
 use indicatif::{ProgressBar, ProgressStyle};
 use sigma_srn::{Engine, Gpu, Intrinsics};
-use srn_data::{Dataset, LoadedView, SrnSet};
+use srn_data::{Dataset, LoadedView, SrnSet, sheet};
 use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::prelude::*;
 
@@ -128,11 +128,11 @@ pub fn camera(view: &LoadedView) -> (DMat4, Intrinsics) {
     (world_from_camera, Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 })
 }
 
-/// A picture of depths: the nearer the lighter, from 0.6 object units before the origin to 0.6 behind it, for a camera that is
+/// A picture of depths, from 0.6 object units before the origin (dark) to 0.6 behind it (light), for a camera that is
 /// `distance` away from it.
 pub fn depth_picture(depth: &[f32], side: u32, distance: f64) -> RgbImage {
-    let shade = |z: f32| (0.5 - (f64::from(z) - distance) / 1.2).clamp(0.0, 1.0) * 255.0;
-    RgbImage::from_fn(side, side, |u, v| Rgb([shade(depth[(v * side + u) as usize]).round() as u8; 3]))
+    let colour = |z: f32| Rgb(sheet::ramp(&sheet::VIRIDIS, 0.5 + (f64::from(z) - distance) / 1.2));
+    RgbImage::from_fn(side, side, |u, v| colour(depth[(v * side + u) as usize]))
 }
 
 /// Peak signal-to-noise ratio in dB of colours in [-1, 1], the rendered ones clamped to that range as a picture would be.

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use sigma_cli::common;
-use sigma_cli::train::fit;
+use sigma_cli::train::{adapt, fit};
 
 /// Trains σSRN models on SRN data sets.
 ///
@@ -20,10 +20,13 @@ struct Cli {
 enum Command {
     /// Train a model from nothing, or go on with a run that was stopped.
     Fit(fit::FitArgs),
+    /// Fit latent codes of new instances to a few views of each, all networks frozen.
+    Adapt(adapt::AdaptArgs),
 }
 
 fn main() -> ExitCode {
     common::finish(match Cli::parse().command {
         Command::Fit(args) => fit::fit(&args),
+        Command::Adapt(args) => adapt::adapt(&args),
     })
 }

@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use sigma_srn::{Engine, Losses, Metadata, Model, Train, Trainer, stream, write_atomically};
 use srn_data::{Dataset, SrnSet, pixels, sheet};
 
-use super::{Changeable, ForGood, Settings, Shown, render, training_batch};
+use super::{Changeable, ForGood, Settings, Shown, psnr_of_each, render, training_batch};
 use crate::common::{self, EngineArgs, Result};
 
 /// Time between checkpoints.
@@ -183,24 +183,19 @@ fn median_distance(set: &Dataset) -> f64 {
 /// Mean PSNR over the views, and a picture of them: target, rendering and depth side by side.
 fn look(engine: &Engine, model: &Model, views: &[Shown], side: u32, distance: f64) -> Result<(f64, RgbImage)> {
     let rendering = render(engine, model, views, side)?;
-    let pixels = (side * side) as usize;
-    let mut cells = vec![];
-    let mut sum = 0.0;
-    for ((&(instance, view), rgb), depth) in
-        views.iter().zip(rendering.rgb.chunks(3 * pixels)).zip(rendering.depth.chunks(pixels))
-    {
-        let psnr = common::psnr(rgb, &view.rgb);
-        sum += psnr;
-        let picture = |rgb| pixels::rgb8(rgb, side as usize, side as usize);
-        cells.push((picture(&view.rgb), model.instance_name(instance)));
-        cells.push((picture(rgb), format!("{psnr:.1} dB")));
-        cells.push((common::depth_picture(depth, side, distance), "depth".into()));
-    }
+    let psnr = psnr_of_each(&rendering, views);
     // Large enough for the labels.
-    let factor = 96u32.div_ceil(side);
-    let cells: Vec<_> = cells.iter().map(|(picture, label)| (sheet::enlarge(picture, factor), label.as_str())).collect();
-    let cells: Vec<_> = cells.iter().map(|(picture, label)| (picture, *label)).collect();
-    Ok((sum / views.len() as f64, sheet::grid(&cells, 6)))
+    let picture = |rgb: &[f32]| sheet::enlarge(&pixels::rgb8(rgb, side as usize, side as usize), 96u32.div_ceil(side));
+    let depth_picture = |depth| sheet::enlarge(&common::depth_picture(depth, side, distance), 96u32.div_ceil(side));
+    let count = (side * side) as usize;
+    let mut cells = vec![];
+    for (k, &(instance, view)) in views.iter().enumerate() {
+        cells.push((picture(&view.rgb), model.instance_name(instance)));
+        cells.push((picture(&rendering.rgb[3 * k * count..][..3 * count]), format!("{:.1} dB", psnr[k])));
+        cells.push((depth_picture(&rendering.depth[k * count..][..count]), "depth".into()));
+    }
+    let cells: Vec<_> = cells.iter().map(|(picture, label)| (picture, label.as_str())).collect();
+    Ok((psnr.iter().sum::<f64>() / psnr.len() as f64, sheet::grid(&cells, 6)))
 }
 
 /// Metrics first: a checkpoint's steps must all be in them.

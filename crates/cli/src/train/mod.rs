@@ -8,7 +8,7 @@ use rand::seq::index;
 use sigma_srn::{Engine, Model, Random, Rays, Renderer, Rendering, TrainingBatch, pixel_grid};
 use srn_data::LoadedView;
 
-use crate::common::{Result, camera};
+use crate::common::{Result, camera, psnr};
 
 pub use settings::{Changeable, ForGood, Preset, Settings};
 
@@ -40,4 +40,10 @@ fn training_batch(views: &[Shown], side: u32, rays: u32, random: &mut Random) ->
 fn render(engine: &Engine, model: &Model, views: &[Shown], side: u32) -> Result<Rendering> {
     let (instances, cameras): (Vec<_>, Vec<_>) = views.iter().map(|&(instance, view)| (instance, camera(view))).unzip();
     Ok(Renderer::new(engine, model, views.len() as u32, side, side)?.render(&instances, &cameras, 0)?)
+}
+
+/// PSNR of each view in dB.
+fn psnr_of_each(rendering: &Rendering, views: &[Shown]) -> Vec<f64> {
+    let pictures = rendering.rgb.chunks(rendering.rgb.len() / views.len());
+    pictures.zip(views).map(|(rgb, (_, view))| psnr(rgb, &view.rgb)).collect()
 }

@@ -92,7 +92,7 @@ pub struct ForGood {
     #[arg(long, value_name = "PIXELS", value_parser = at_least_1())]
     side: Option<u32>,
     /// Use only the first views of each instance, this many [compact all, paper 50].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "N", value_parser = at_least_1())]
     views: Option<u32>,
     /// Images per step [10].
     #[arg(long, value_name = "N", value_parser = at_least_1())]
@@ -140,7 +140,7 @@ pub struct Changeable {
     decay_from: Option<u64>,
 }
 
-fn at_least_1() -> clap::builder::RangedI64ValueParser<u32> {
+pub(super) fn at_least_1() -> clap::builder::RangedI64ValueParser<u32> {
     clap::value_parser!(u32).range(1..)
 }
 
