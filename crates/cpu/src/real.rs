@@ -13,6 +13,8 @@ pub trait Real: Float + AddAssign + Sum + Default + Send + Sync + std::fmt::Debu
     fn of_f32(value: f32) -> Self;
     /// To a device value.
     fn as_f32(self) -> f32;
+    /// To `f64`: cheap ops with three values per ray, and sums over rows, compute there and round once.
+    fn wide(self) -> f64;
     /// `e^x`, in a form that the compiler can vectorise.
     fn exponential(self) -> Self;
 
@@ -41,6 +43,7 @@ pub trait Real: Float + AddAssign + Sum + Default + Send + Sync + std::fmt::Debu
 
 impl Real for f64 {
     const NAME: &'static str = "f64";
+    #[inline(always)]
     fn of(value: f64) -> Self {
         value
     }
@@ -49,6 +52,10 @@ impl Real for f64 {
     }
     fn as_f32(self) -> f32 {
         self as f32
+    }
+    #[inline(always)]
+    fn wide(self) -> f64 {
+        self
     }
     fn exponential(self) -> Self {
         self.exp()
@@ -71,6 +78,10 @@ impl Real for f32 {
     #[inline(always)]
     fn as_f32(self) -> f32 {
         self
+    }
+    #[inline(always)]
+    fn wide(self) -> f64 {
+        self.into()
     }
 
     /// `2^n · e^r` with `|r| ≤ ln 2 / 2` and a polynomial of degree 7 for `e^r`: relative error below 2e-7, no branches.

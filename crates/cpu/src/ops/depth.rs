@@ -12,7 +12,7 @@ fn image(p: RowsParams, row: usize) -> usize {
 pub fn forward<T: Real>(p: RowsParams, world_from_camera: &[T], x: &[T], depth: &mut [T]) {
     for (row, (x, depth)) in x.chunks_exact(3).zip(depth).take((p.groups * p.rows_per_group) as usize).enumerate() {
         let m = &world_from_camera[12 * image(p, row)..];
-        *depth = (0..3).map(|axis| m[4 * axis + 2] * (x[axis] - m[4 * axis + 3])).sum();
+        *depth = T::of((0..3).map(|axis| m[4 * axis + 2].wide() * (x[axis].wide() - m[4 * axis + 3].wide())).sum());
     }
 }
 

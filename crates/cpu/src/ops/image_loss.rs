@@ -20,7 +20,8 @@ fn sums<T: Real>(p: ImageLossParams, partial: &mut [T], f: impl Fn(usize, usize)
         let (group, chunk) = (index / p.chunks as usize, index % p.chunks as usize);
         let rows = chunk_of(chunk, p.chunk_rows, p.rows_per_group);
         let first = group * p.rows_per_group as usize;
-        *partial = (3 * (first + rows.start)..3 * (first + rows.end)).map(|value| f(group, value)).sum();
+        let sum = (3 * (first + rows.start)..3 * (first + rows.end)).map(|value| f(group, value).wide()).sum::<f64>();
+        *partial = T::of(sum);
     }
 }
 

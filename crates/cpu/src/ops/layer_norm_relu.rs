@@ -71,7 +71,6 @@ pub fn backward_affine<T: Real>(p: LayerNormParams, x: &[T], stats: &[T], affine
     let width = p.features as usize;
     partial[..2 * width * p.chunks as usize].par_chunks_mut(2 * width).enumerate().for_each(|(chunk, partial)| {
         let rows = chunk_of(chunk, p.chunk_rows, p.rows);
-        partial.fill(T::zero());
         let values = rows.start * width..rows.end * width;
         affine_rows(&x[values.clone()], &stats[2 * rows.start..2 * rows.end], affine, &d_y[values], partial);
     });
@@ -81,15 +80,18 @@ vectorised! {
     fn affine_rows<T: Real>(x: &[T], stats: &[T], affine: &[T], d_y: &[T], partial: &mut [T]) {
         let width = affine.len() / 2;
         let (gamma, beta) = affine.split_at(width);
-        let (d_gamma, d_beta) = partial.split_at_mut(width);
+        let (mut d_gamma, mut d_beta) = (vec![0.0; width], vec![0.0; width]);
         for ((x, d_y), stats) in x.chunks_exact(width).zip(d_y.chunks_exact(width)).zip(stats.chunks_exact(2)) {
-            let d_affine = d_gamma.iter_mut().zip(&mut *d_beta);
+            let d_affine = d_gamma.iter_mut().zip(&mut d_beta);
             for ((((d_gamma, d_beta), (&x, &d_y)), &gamma), &beta) in d_affine.zip(x.iter().zip(d_y)).zip(gamma).zip(beta) {
                 let normalised = (x - stats[0]) * stats[1];
                 let d = if normalised * gamma + beta > T::zero() { d_y } else { T::zero() };
-                *d_gamma += d * normalised;
-                *d_beta += d;
+                *d_gamma += (d * normalised).wide();
+                *d_beta += d.wide();
             }
+        }
+        for (partial, &sum) in partial.iter_mut().zip(d_gamma.iter().chain(&d_beta)) {
+            *partial = T::of(sum);
         }
     }
 }

@@ -111,11 +111,12 @@ pub fn backward_weight<T: Real>(p: LinearParams, x: &[T], d_y: &[T], partial: &m
         let x = &x[rows.start * ins..rows.end * ins];
         let size = [outs, ins, rows.len()];
         product(size, d_weight, Matrix(d_y, [1, outs]), Matrix(x, [ins, 1]), p.accumulate == 1, threads);
-        if p.accumulate == 0 {
-            d_bias.fill(T::zero());
-        }
+        let mut sums = vec![0.0; outs];
         for d_y in d_y.chunks_exact(outs) {
-            d_bias.iter_mut().zip(d_y).for_each(|(sum, &d)| *sum += d);
+            sums.iter_mut().zip(d_y).for_each(|(sum, d)| *sum += d.wide());
+        }
+        for (d_bias, sum) in d_bias.iter_mut().zip(sums) {
+            *d_bias = T::of(sum + if p.accumulate == 1 { d_bias.wide() } else { 0.0 });
         }
     };
     let partial = &mut partial[..parts * parameters];

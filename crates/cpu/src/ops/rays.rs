@@ -5,18 +5,18 @@ use srn_shaders::RowsParams;
 use super::{chunk_of, for_rows2};
 use crate::Real;
 
-fn lift<T: Real>(intrinsics: &[T], uv: &[T]) -> [T; 3] {
-    let [fx, fy, cx, cy] = [intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]];
-    [(uv[0] - cx) / fx, (uv[1] - cy) / fy, T::one()]
+fn lift<T: Real>(intrinsics: &[T], uv: &[T]) -> [f64; 3] {
+    let [fx, fy, cx, cy] = [0, 1, 2, 3].map(|k| intrinsics[k].wide());
+    [(uv[0].wide() - cx) / fx, (uv[1].wide() - cy) / fy, 1.0]
 }
 
-fn dot<T: Real>(a: [T; 3], b: [T; 3]) -> T {
+fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 /// `R q`, for a 3×4 matrix.
-fn rotate<T: Real>(m: &[T], q: [T; 3]) -> [T; 3] {
-    [0, 1, 2].map(|row| dot([m[4 * row], m[4 * row + 1], m[4 * row + 2]], q))
+fn rotate<T: Real>(m: &[T], q: [f64; 3]) -> [f64; 3] {
+    [0, 1, 2].map(|row| dot([0, 1, 2].map(|column| m[4 * row + column].wide()), q))
 }
 
 /// Rows to `origin, direction`.
@@ -38,8 +38,8 @@ pub fn forward<T: Real>(
             let world = rotate(m, lift(&intrinsics[4 * image..4 * image + 4], &uv[2 * row..2 * row + 2]));
             let length = dot(world, world).sqrt();
             for axis in 0..3 {
-                origin[axis] = m[4 * axis + 3] + z0[row] * world[axis];
-                direction[axis] = world[axis] / length;
+                origin[axis] = T::of(m[4 * axis + 3].wide() + z0[row].wide() * world[axis]);
+                direction[axis] = T::of(world[axis] / length);
             }
         }
     });
@@ -60,10 +60,10 @@ pub fn backward<T: Real>(
         let (group, chunk) = (index / p.chunks as usize, index % p.chunks as usize);
         let image = p.first_group as usize + group;
         let m = &world_from_camera[12 * image..12 * image + 12];
-        partial.fill(T::zero());
+        let mut sums = [0.0; 12];
         for row in chunk_of(chunk, p.chunk_rows, p.rows_per_group) {
             let row = group * p.rows_per_group as usize + row;
-            let three = |values: &[T]| [values[3 * row], values[3 * row + 1], values[3 * row + 2]];
+            let three = |values: &[T]| [0, 1, 2].map(|axis| values[3 * row + axis].wide());
             let (d_origin, d_direction) = (three(d_origin), three(d_direction));
             let q = lift(&intrinsics[4 * image..4 * image + 4], &uv[2 * row..2 * row + 2]);
             let world = rotate(m, q);
@@ -71,12 +71,15 @@ pub fn backward<T: Real>(
             let direction = world.map(|value| value / length);
             let along = dot(d_direction, direction);
             for axis in 0..3 {
-                let d_world = z0[row] * d_origin[axis] + (d_direction[axis] - along * direction[axis]) / length;
+                let d_world = z0[row].wide() * d_origin[axis] + (d_direction[axis] - along * direction[axis]) / length;
                 for (k, q) in q.into_iter().enumerate() {
-                    partial[4 * axis + k] += d_world * q;
+                    sums[4 * axis + k] += d_world * q;
                 }
-                partial[4 * axis + 3] += d_origin[axis];
+                sums[4 * axis + 3] += d_origin[axis];
             }
+        }
+        for (partial, sum) in partial.iter_mut().zip(sums) {
+            *partial = T::of(sum);
         }
     }
 }
