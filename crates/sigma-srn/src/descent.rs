@@ -1,7 +1,7 @@
 //! One step of pose estimation for many hypotheses at once (spec 4): render, loss, gradient to the six numbers, Adam.
 
 use srn_plan::ops::{adam, gmsd, image_loss, keep_best, pose, rays, tile as tile_ops};
-use srn_plan::{BufferId, Builder, Executor, Plan, PlanError, StageId, tiles};
+use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, tiles};
 
 use crate::camera::Pose6;
 use crate::engine::{Engine, Runner};
@@ -89,7 +89,7 @@ impl Descent {
         }
         let rows = hypotheses * width * height;
         let (plan, handles) =
-            engine.fit(rows, model.layout.features(), |tile_rows| build(engine.builder(), model, shape, loss, tile_rows))?;
+            engine.fit(rows, model.layout.features(), |b, tile_rows| build(b, model, shape, loss, tile_rows))?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, model)?;
         Ok(Descent { runner, handles, shape, steps: 0 })
@@ -209,96 +209,95 @@ fn poses(values: &[f32]) -> Vec<Pose6> {
     values.chunks_exact(6).map(|pose| Pose6(std::array::from_fn(|k| pose[k].into()))).collect()
 }
 
-fn build(mut b: Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u32) -> Result<(Plan, Handles), PlanError> {
-    let p = &mut b; // the plan so far
+fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u32) -> Result<Handles, PlanError> {
     let Shape { hypotheses, width, height, instances: slots } = shape;
     let rays_per_image = width * height;
     let values = 3 * hypotheses as usize * rays_per_image as usize;
-    let network = Network::new(p, model, Batch { images: hypotheses, rays: rays_per_image, slots }, Trainable::Nothing, false)?;
+    let network = Network::new(b, model, Batch { images: hypotheses, rays: rays_per_image, slots }, Trainable::Nothing, false)?;
     let cut = tiles(hypotheses, rays_per_image, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
-    let saved = Saved::new(p, &network, Purpose::Pose, most)?;
-    let scratch = Scratch::new(p, &network, &saved)?;
-    let hyper_saved = HyperSaved::new(p, &network)?;
+    let saved = Saved::new(b, &network, Purpose::Pose, most)?;
+    let scratch = Scratch::new(b, &network, &saved)?;
+    let hyper_saved = HyperSaved::new(b, &network)?;
     let images = gmsd::Images { count: hypotheses, width, height };
     let partial_len = cut.iter().map(|tile| backward::partial_len(&network, tile.rows)).max().unwrap_or(1);
     let sums = image_loss::partial_len(hypotheses, rays_per_image).max(images.partial_len());
-    let partial = p.scratch("partial sums", partial_len.max(sums))?;
+    let partial = b.scratch("partial sums", partial_len.max(sums))?;
     let n = hypotheses as usize;
-    let target = p.input("target rgb", values)?;
-    let loss_buffer = p.scratch("loss", n)?;
-    let pose6 = p.input("pose6", 6 * n)?;
-    let (d_pose6, d_matrix) = (p.scratch("d pose6", 6 * n)?, p.scratch("d world_from_camera", 12 * n)?);
+    let target = b.input("target rgb", values)?;
+    let loss_buffer = b.scratch("loss", n)?;
+    let pose6 = b.input("pose6", 6 * n)?;
+    let (d_pose6, d_matrix) = (b.scratch("d pose6", 6 * n)?, b.scratch("d world_from_camera", 12 * n)?);
 
-    let instances = p.stage("instances");
-    forward::hypernetwork(p, &network, &hyper_saved)?;
+    let instances = b.stage("instances");
+    forward::hypernetwork(b, &network, &hyper_saved)?;
 
-    let targets = p.stage("targets");
+    let targets = b.stage("targets");
     // Per-pixel losses need the number of target values that are not white; GMSD needs the target's luma.
     let comparison = match loss.per_pixel() {
         Some(kind) => {
-            let count = p.scratch("target count", n)?;
-            image_loss::count(p, hypotheses, rays_per_image, target, partial, count)?;
-            Comparison::PerPixel { kind, count, tile_target: p.scratch("tile target", 3 * most as usize)? }
+            let count = b.scratch("target count", n)?;
+            image_loss::count(b, hypotheses, rays_per_image, target, partial, count)?;
+            Comparison::PerPixel { kind, count, tile_target: b.scratch("tile target", 3 * most as usize)? }
         }
         None => {
             let pooled = n * images.pooled() as usize;
             let saved = gmsd::Saved {
-                luma: p.scratch("luma", pooled)?,
-                target_luma: p.scratch("target luma", pooled)?,
-                quality: p.scratch("quality", pooled)?,
-                moments: p.scratch("moments", 2 * n)?,
+                luma: b.scratch("luma", pooled)?,
+                target_luma: b.scratch("target luma", pooled)?,
+                quality: b.scratch("quality", pooled)?,
+                moments: b.scratch("moments", 2 * n)?,
             };
-            gmsd::pool(p, images, target, saved.target_luma)?;
-            Comparison::Gmsd { saved, d_response: p.scratch("d response", 2 * pooled)?, d_rgb: p.scratch("d rgb", values)? }
+            gmsd::pool(b, images, target, saved.target_luma)?;
+            Comparison::Gmsd { saved, d_response: b.scratch("d response", 2 * pooled)?, d_rgb: b.scratch("d rgb", values)? }
         }
     };
 
-    let evaluate = p.stage("evaluate");
+    let evaluate = b.stage("evaluate");
     let mut started = Started::default();
-    pose::forward(p, hypotheses, pose6, network.world_from_camera)?;
+    pose::forward(b, hypotheses, pose6, network.world_from_camera)?;
     // A loss of whole images needs all tiles before the first gradient; the tiles are rendered once more on the way back.
     if let Comparison::Gmsd { saved: maps, d_response, d_rgb } = comparison {
         for &tile in &cut {
-            forward::render(p, &network, &saved, tile)?;
+            forward::render(b, &network, &saved, tile)?;
         }
-        gmsd::pool(p, images, network.rgb, maps.luma)?;
-        gmsd::similarity(p, images, maps)?;
-        gmsd::deviation(p, images, maps, partial, loss_buffer)?;
-        gmsd::backward(p, images, 1.0, maps, loss_buffer, d_response, d_rgb)?;
+        gmsd::pool(b, images, network.rgb, maps.luma)?;
+        gmsd::similarity(b, images, maps)?;
+        gmsd::deviation(b, images, maps, partial, loss_buffer)?;
+        gmsd::backward(b, images, 1.0, maps, loss_buffer, d_response, d_rgb)?;
     }
     for &tile in &cut {
         match comparison {
             Comparison::PerPixel { kind, count, tile_target } => {
-                forward::render(p, &network, &saved, tile)?;
-                tile_ops::gather(p, tile, 3, target, tile_target)?;
-                image_loss::backward(p, kind, tile.rows, rays_per_image, 1.0, saved.rgb(), tile_target, count, scratch.d_rgb)?;
+                forward::render(b, &network, &saved, tile)?;
+                tile_ops::gather(b, tile, 3, target, tile_target)?;
+                image_loss::backward(b, kind, tile.rows, rays_per_image, 1.0, saved.rgb(), tile_target, count, scratch.d_rgb)?;
             }
             Comparison::Gmsd { d_rgb, .. } => {
                 if cut.len() > 1 {
-                    forward::render(p, &network, &saved, tile)?;
+                    forward::render(b, &network, &saved, tile)?;
                 }
-                tile_ops::gather(p, tile, 3, d_rgb, scratch.d_rgb)?;
+                tile_ops::gather(b, tile, 3, d_rgb, scratch.d_rgb)?;
             }
         }
-        backward::render(p, &network, &saved, &scratch, partial, tile, false, &mut started)?;
+        backward::render(b, &network, &saved, &scratch, partial, tile, false, &mut started)?;
         let accumulate = started.accumulate(d_matrix, tile.rows.first_group);
         let pixels = network.pixels(&saved);
-        rays::backward(p, tile.rows, pixels, scratch.d_origin, scratch.d_direction, partial, d_matrix, accumulate)?;
+        rays::backward(b, tile.rows, pixels, scratch.d_origin, scratch.d_direction, partial, d_matrix, accumulate)?;
     }
     if let Comparison::PerPixel { kind, count, .. } = comparison {
-        image_loss::forward(p, kind, hypotheses, rays_per_image, network.rgb, target, count, partial, loss_buffer)?;
+        image_loss::forward(b, kind, hypotheses, rays_per_image, network.rgb, target, count, partial, loss_buffer)?;
     }
-    pose::backward(p, hypotheses, pose6, d_matrix, d_pose6)?;
+    pose::backward(b, hypotheses, pose6, d_matrix, d_pose6)?;
 
-    let descend = p.stage("descend");
-    let schedule = p.input("schedule", 3)?;
-    let moments = [p.input("m pose6", 6 * n)?, p.input("v pose6", 6 * n)?];
-    let (best_loss, best_pose6) = (p.input("best loss", n)?, p.input("best pose6", 6 * n)?);
-    keep_best::step(p, hypotheses, loss_buffer, pose6, best_loss, best_pose6)?;
-    adam::step(p, 6 * hypotheses, d_pose6, schedule, pose6, moments[0], moments[1])?;
+    let descend = b.stage("descend");
+    let schedule = b.input("schedule", 3)?;
+    let moments = [b.input("m pose6", 6 * n)?, b.input("v pose6", 6 * n)?];
+    let (best_loss, best_pose6) = (b.input("best loss", n)?, b.input("best pose6", 6 * n)?);
+    keep_best::step(b, hypotheses, loss_buffer, pose6, best_loss, best_pose6)?;
+    adam::step(b, 6 * hypotheses, d_pose6, schedule, pose6, moments[0], moments[1])?;
 
-    let handles = Handles {
+    Ok(Handles {
         network,
         target,
         pose6,
@@ -312,8 +311,7 @@ fn build(mut b: Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u32
         targets,
         evaluate,
         descend,
-    };
-    Ok((b.finish()?, handles))
+    })
 }
 
 /// How renders are compared, with the buffers for it.

@@ -98,7 +98,7 @@ impl Engine {
     }
 
     /// A builder with this engine's limits.
-    pub(crate) fn builder(&self) -> Builder {
+    fn builder(&self) -> Builder {
         Builder::new(match &self.kind {
             Kind::Gpu(gpu) => gpu.max_binding_bytes(),
             Kind::Cpu | Kind::CpuF64 => u64::MAX,
@@ -111,7 +111,7 @@ impl Engine {
         &self,
         rows: u32,
         features: u32,
-        build: impl Fn(u32) -> Result<(Plan, T), PlanError>,
+        build: impl Fn(&mut Builder, u32) -> Result<T, PlanError>,
     ) -> Result<(Plan, T), Error> {
         let preferred = self.tile_rows.unwrap_or(match &self.kind {
             Kind::Gpu(_) => GPU_TILE_ROWS,
@@ -119,7 +119,9 @@ impl Engine {
         });
         let mut tile_rows = rows.min(preferred).max(1);
         loop {
-            let needed = match build(tile_rows) {
+            let mut builder = self.builder();
+            let built = build(&mut builder, tile_rows).and_then(|rest| Ok((builder.finish()?, rest)));
+            let needed = match built {
                 Ok((plan, rest)) if self.bytes(&plan) <= self.budget => return Ok((plan, rest)),
                 Ok((plan, _)) => self.bytes(&plan),
                 Err(PlanError::TooLarge { .. }) if tile_rows > 1 => u64::MAX,

@@ -27,5 +27,10 @@ pub use model::{Block, Kind, Layout, Metadata, Model, ModelConfig, Parameter, wr
 pub use random::{Random, stream};
 pub use rays::{Rays, pixel_grid};
 pub use renderer::{Renderer, Rendering};
-pub use srn_gpu::{AdapterInfo, Gpu, adapters};
+pub use srn_gpu::{AdapterInfo, Gpu, adapters, wgpu};
 pub use trainer::{Losses, Train, Trainer, TrainingBatch};
+
+/// The README's code, compiled and run as a documentation test.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+pub struct Readme;

@@ -1,8 +1,9 @@
 //! Novel views: rgb and depth of instances from given cameras.
 
 use glam::DMat4;
+use srn_gpu::wgpu;
 use srn_plan::ops::pack_rgba8;
-use srn_plan::{BufferId, Builder, Plan, PlanError, StageId, tiles};
+use srn_plan::{BufferId, Builder, PlanError, StageId, tiles};
 
 use crate::camera::Intrinsics;
 use crate::engine::{Engine, Runner};
@@ -131,27 +132,21 @@ impl Renderer {
     }
 }
 
-fn build(
-    mut b: Builder,
-    model: &Model,
-    views: u32,
-    [width, height]: [u32; 2],
-    tile_rows: u32,
-) -> Result<(Plan, Handles), PlanError> {
+fn build(b: &mut Builder, model: &Model, views: u32, [width, height]: [u32; 2], tile_rows: u32) -> Result<Handles, PlanError> {
     let rays = width * height;
-    let network = Network::new(&mut b, model, Batch { images: views, rays, slots: views }, Trainable::Nothing, true)?;
+    let network = Network::new(b, model, Batch { images: views, rays, slots: views }, Trainable::Nothing, true)?;
     let cut = tiles(views, rays, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
-    let saved = Saved::new(&mut b, &network, Purpose::Render, most)?;
-    let hyper_saved = HyperSaved::new(&mut b, &network)?;
+    let saved = Saved::new(b, &network, Purpose::Render, most)?;
+    let hyper_saved = HyperSaved::new(b, &network)?;
     let packed = b.scratch_u32("packed rgba8", (pack_rgba8::stride(width) * height) as usize)?;
     let instances = b.stage("instances");
-    forward::hypernetwork(&mut b, &network, &hyper_saved)?;
+    forward::hypernetwork(b, &network, &hyper_saved)?;
     let render = b.stage("render");
     for &tile in &cut {
-        forward::render(&mut b, &network, &saved, tile)?;
+        forward::render(b, &network, &saved, tile)?;
     }
     let pack = b.stage("pack");
-    pack_rgba8::forward(&mut b, width, height, 0, network.rgb, packed)?;
-    Ok((b.finish()?, Handles { network, packed, instances, render, pack }))
+    pack_rgba8::forward(b, width, height, 0, network.rgb, packed)?;
+    Ok(Handles { network, packed, instances, render, pack })
 }

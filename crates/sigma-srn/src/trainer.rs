@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use srn_plan::ops::{adam, depth, depth_loss, image_loss, latent_loss, tile as tile_ops};
-use srn_plan::{BufferId, Builder, Executor, Plan, PlanError, Rows, StageId, tiles};
+use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, tiles};
 
 use crate::engine::{Engine, Runner};
 use crate::model::{Model, Tensors, read_tensors, write_tensors};
@@ -93,10 +93,8 @@ impl Trainer {
                 return Err(Error::Setting { field, what: "must be at least 1".into() });
             }
         }
-        let (plan, handles) = {
-            let features = model.layout.features();
-            engine.fit(images * rays, features, |tile_rows| build(engine.builder(), &model, train, batch, tile_rows))?
-        };
+        let features = model.layout.features();
+        let (plan, handles) = engine.fit(images * rays, features, |b, tile_rows| build(b, &model, train, batch, tile_rows))?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, &model)?;
         let slots: Vec<u32> = (0..images).collect();
@@ -234,8 +232,7 @@ impl Trainer {
     }
 }
 
-fn build(mut b: Builder, model: &Model, train: Train, batch: Batch, tile_rows: u32) -> Result<(Plan, Handles), PlanError> {
-    let b = &mut b;
+fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: u32) -> Result<Handles, PlanError> {
     let trainable = if train == Train::Codes { Trainable::Codes } else { Trainable::Everything };
     let network = Network::new(b, model, batch, trainable, true)?;
     let (images, rays) = (batch.images, batch.rays);
@@ -287,7 +284,7 @@ fn build(mut b: Builder, model: &Model, train: Train, batch: Batch, tile_rows: u
         adam::step(b, len as u32, d, schedule, network.parameters[number], m, v)?;
         moments.push((number, [m, v]));
     }
-    let handles = Handles {
+    Ok(Handles {
         network,
         target,
         schedule,
@@ -297,8 +294,5 @@ fn build(mut b: Builder, model: &Model, train: Train, batch: Batch, tile_rows: u
         moments,
         gradients,
         update,
-    };
-    let plan = std::mem::replace(b, Builder::new(0)).finish()?;
-    debug_assert!(cut.iter().map(|tile| tile.rows).map(Rows::count).sum::<u32>() == rows);
-    Ok((plan, handles))
+    })
 }
