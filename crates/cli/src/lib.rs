@@ -1,4 +1,5 @@
 //! This crate owns the command lines: flags, progress, reports and exit codes. It does not know the network or the file formats.
 
 pub mod common;
+pub mod pose;
 pub mod train;

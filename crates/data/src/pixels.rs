@@ -23,12 +23,12 @@ impl Pixels {
         Ok(Self { width: rgba.width() as usize, height: rgba.height() as usize, data })
     }
 
-    /// The centred square, and how many columns and rows were cut off on the left and on top.
-    pub fn centre_square(&self) -> (Self, [usize; 2]) {
+    /// The centred square.
+    pub fn centre_square(&self) -> Self {
         let side = self.width.min(self.height);
         let [x0, y0] = [(self.width - side) / 2, (self.height - side) / 2];
         let row = |y: usize| &self.data[3 * (y * self.width + x0)..][..3 * side];
-        (Self { width: side, height: side, data: (y0..y0 + side).flat_map(row).copied().collect() }, [x0, y0])
+        Self { width: side, height: side, data: (y0..y0 + side).flat_map(row).copied().collect() }
     }
 
     /// A `width × height` image in which each pixel is the mean of the area that it covers here.
@@ -110,8 +110,8 @@ mod tests {
 
     #[test]
     fn the_square_is_centred() {
-        let (square, cut) = grey(4, 2, &[0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]).centre_square();
-        assert_eq!((square, cut), (grey(2, 2, &[0.1, 0.2, 0.5, 0.6]), [1, 0]));
+        let square = grey(4, 2, &[0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]).centre_square();
+        assert_eq!(square, grey(2, 2, &[0.1, 0.2, 0.5, 0.6]));
     }
 
     #[test]

@@ -175,12 +175,14 @@ pub fn load_square(path: &Path, intrinsics: &Intrinsics, side: usize) -> Result<
         let found = format!("{}×{}", image.width, image.height);
         return Err(Error::field(path, "size", format!("the aspect of intrinsics.txt, {width}×{height}"), found));
     }
-    let (square, cut) = image.centre_square();
-    let file_scale = image.width as f64 / width as f64;
-    let scale = side as f64 / square.width as f64;
-    let focal = intrinsics.focal * file_scale * scale;
-    let centre = [0, 1].map(|i| (intrinsics.centre[i] * file_scale - cut[i] as f64) * scale);
-    Ok((square.area_resample(side, side), [focal, focal, centre[0], centre[1]].map(|x| x as f32)))
+    let scale = image.width as f64 / width as f64;
+    let in_file = Intrinsics {
+        focal: intrinsics.focal * scale,
+        centre: intrinsics.centre.map(|c| c * scale),
+        size: [image.width, image.height],
+    };
+    let Intrinsics { focal, centre: [cx, cy], .. } = in_file.of_square(side);
+    Ok((image.centre_square().area_resample(side, side), [focal, focal, cx, cy].map(|x| x as f32)))
 }
 
 /// Reads a pose file: 16 numbers, a rigid `world_from_camera`.
@@ -247,6 +249,18 @@ impl Intrinsics {
             return Err(Error::field(path, "height width", "positive whole numbers", format!("{size:?}")));
         }
         Ok(Self { focal: camera[0], centre: [camera[1], camera[2]], size: [size[1] as usize, size[0] as usize] })
+    }
+}
+
+impl Intrinsics {
+    /// The intrinsics of the centre square, resampled to `side` pixels (see [`load_square`]).
+    pub fn of_square(&self, side: usize) -> Self {
+        let [width, height] = self.size;
+        let square = width.min(height);
+        let scale = side as f64 / square as f64;
+        let cut = self.size.map(|s| ((s - square) / 2) as f64);
+        let centre = [0, 1].map(|i| (self.centre[i] - cut[i]) * scale);
+        Self { focal: self.focal * scale, centre, size: [side, side] }
     }
 }
 

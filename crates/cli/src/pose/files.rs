@@ -15,9 +15,7 @@ use crate::common::Result;
 /// Reads a model; every error names the file.
 pub fn load_model(path: &Path) -> Result<Model> {
     Model::load(path).map_err(|error| match error {
-        sigma_srn::Error::MissingTensor { .. } | sigma_srn::Error::Tensor { .. } => {
-            format!("{}: {error}", path.display()).into()
-        }
+        sigma_srn::Error::MissingTensor { .. } | sigma_srn::Error::Tensor { .. } => format!("{}: {error}", path.display()).into(),
         error => error.into(),
     })
 }
@@ -137,11 +135,19 @@ impl Picture {
 }
 
 /// Width and height of a picture.
-pub fn size_of(path: &Path) -> Result<[usize; 2]> {
+fn size_of(path: &Path) -> Result<[usize; 2]> {
     let about = |error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
     let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format).map_err(|e| about(&e))?;
     let (width, height) = reader.into_dimensions().map_err(|e| about(&format!("not a readable image: {e}")))?;
     Ok([width as usize, height as usize])
+}
+
+/// Side of the pictures that a model takes: as it was trained, or else the shorter side of `picture`.
+pub fn model_side(model: &Model, picture: &Path) -> Result<u32> {
+    match model.metadata.side {
+        Some(side) => Ok(side),
+        None => Ok(size_of(picture)?.into_iter().min().unwrap_or(0) as u32),
+    }
 }
 
 /// Fails if one of the files is there already.

@@ -4,11 +4,12 @@ mod draw;
 pub mod estimate;
 pub mod evaluate;
 mod files;
+mod record;
 pub mod render;
 mod search;
 
 /// A finite number above zero.
-fn positive(text: &str) -> std::result::Result<f64, String> {
+fn positive(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(x) if x > 0.0 && f64::is_finite(x) => Ok(x),
         _ => Err("expected a number above 0".into()),

@@ -87,6 +87,16 @@ impl From<&str> for Starts {
     }
 }
 
+impl std::fmt::Display for Starts {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Starts::Fixed24 => write!(f, "fixed24"),
+            Starts::Neighbor4 => write!(f, "neighbor4"),
+            Starts::File(path) => write!(f, "{}", path.display()),
+        }
+    }
+}
+
 impl SearchArgs {
     /// The settings of the estimator.
     pub fn options(&self) -> Options {

@@ -1,0 +1,35 @@
+//! `sigma-pose`: finds the camera poses of pictures with a trained model.
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use sigma_cli::common::finish;
+use sigma_cli::pose::{estimate, evaluate, render};
+
+/// Camera poses of pictures by gradient descent through a neural renderer.
+///
+/// Exit status: 0 done, 1 a pose was not found, 2 an error.
+#[derive(Parser)]
+#[command(version, about)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Find the poses of pictures. Exit status 1 if a render from the pose found still leaves half of its picture unexplained.
+    Estimate(estimate::Estimate),
+    /// Measure the errors on a data set, by the paper's protocol.
+    Evaluate(evaluate::Evaluate),
+    /// Render an object from any side.
+    Render(render::Render),
+}
+
+fn main() -> ExitCode {
+    finish(match Cli::parse().command {
+        Command::Estimate(args) => estimate::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Render(args) => render::run(&args),
+    })
+}

@@ -1,0 +1,334 @@
+//! `sigma-pose evaluate`: the paper's protocol (spec 4) on a data set.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use glam::DMat4;
+use serde::Serialize;
+use srn_data::sheet;
+use srn_data::srn::{InstanceFiles, SrnSet};
+
+use super::draw;
+use super::files::{Picture, create_dir, load_model, model_side, print, refuse_existing, write_png};
+use super::search::{Found, PoseError, SearchArgs, Starts, search};
+use crate::common::{EngineArgs, Result, camera, progress};
+
+/// Side of a view on the sheet, pixels.
+const SHOWN: u32 = 128;
+/// Searches side by side on the sheet.
+const COLUMNS: usize = 4;
+
+/// Flags of `sigma-pose evaluate`.
+#[derive(Args, Debug)]
+pub struct Evaluate {
+    /// Model, or checkpoint of a training run.
+    #[arg(long, value_name = "FILE")]
+    model: PathBuf,
+    /// Data set in the SRN folder layout, of views that the model has not seen; instances are matched by name.
+    #[arg(long, value_name = "DIR")]
+    data: PathBuf,
+    /// Where to start: `neighbor4`, the true pose turned by 30° to four sides; `fixed24`, all around; or a file with 16 numbers
+    /// per line, a `world_from_camera` each.
+    #[arg(long, value_name = "neighbor4|fixed24|FILE", default_value = "neighbor4")]
+    starts: Starts,
+    /// Views of each instance, evenly spread over those that there are.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
+    views: u32,
+    /// Instances, the first by name.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
+    instances: u32,
+    #[command(flatten)]
+    search: SearchArgs,
+    /// Print everything as JSON.
+    #[arg(long)]
+    json: bool,
+    /// Write results.json and pictures.png, worst first, to this folder.
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Overwrite the files in the folder of --out.
+    #[arg(long)]
+    force: bool,
+    #[command(flatten)]
+    engine: EngineArgs,
+}
+
+/// What `--json` prints and `results.json` holds.
+#[derive(Serialize)]
+struct Report {
+    model: PathBuf,
+    data: PathBuf,
+    starts: String,
+    /// `cpu`, or the adapter's name.
+    executor: String,
+    overall: Summary,
+    instances: Vec<Summary>,
+    views: Vec<ViewReport>,
+}
+
+/// Errors of several views.
+#[derive(Serialize)]
+struct Summary {
+    name: String,
+    views: usize,
+    converged: usize,
+    rotation_deg: Statistics,
+    translation: Statistics,
+    /// Parts of the views with a rotation error of at most 5° and 10°.
+    recall_5_deg: f64,
+    recall_10_deg: f64,
+    /// Rotation error of the start that came nearest to the truth, the winner or not: what a perfect choice would reach.
+    oracle_deg: Statistics,
+    seconds_per_view: f64,
+}
+
+#[derive(Clone, Copy, Serialize)]
+struct Statistics {
+    mean: f64,
+    median: f64,
+}
+
+#[derive(Serialize)]
+struct ViewReport {
+    instance: String,
+    view: String,
+    error: PoseError,
+    /// Errors of the start that came nearest in rotation.
+    oracle: PoseError,
+    start: usize,
+    loss: f64,
+    unexplained: f64,
+    converged: bool,
+    seconds: f64,
+    /// Rows of the estimate.
+    world_from_camera: [[f64; 4]; 4],
+}
+
+/// Runs the command.
+pub fn run(args: &Evaluate) -> Result<bool> {
+    let model = load_model(&args.model)?;
+    let mut instances = SrnSet::open(&args.data)?.instances;
+    let found = instances.len();
+    instances.retain(|files| model.instance(&files.name).is_ok());
+    if instances.is_empty() {
+        let known = model.metadata.instance_names.join(", ");
+        return Err(format!("{}: none of its {found} instances is in the model, which knows {known}", args.data.display()).into());
+    }
+    if instances.len() < found {
+        eprintln!("{} of {found} instances are not in the model and are left out", found - instances.len());
+    }
+    instances.truncate(args.instances as usize);
+    for files in &mut instances {
+        files.views = spread(std::mem::take(&mut files.views), args.views as usize);
+    }
+    let first = instances.iter().flat_map(|files| &files.views).find_map(|view| view.rgb.as_deref());
+    let side = model_side(&model, first.unwrap_or(&args.data))?;
+    let pictures = |files: &InstanceFiles| -> Result<Vec<(Picture, DMat4)>> {
+        let instance = model.instance(&files.name)?;
+        let picture = |view: srn_data::LoadedView| {
+            let (truth, intrinsics) = camera(&view);
+            (Picture { name: view.name, instance, rgb: view.rgb, intrinsics, truth: Some(truth) }, truth)
+        };
+        Ok(files.load(side as usize)?.views.into_iter().map(picture).collect())
+    };
+    // All are read, and the starts known, before the first is searched for.
+    let mut queries = Vec::new();
+    for files in &instances {
+        let (pictures, truths): (Vec<_>, Vec<_>) = pictures(files)?.into_iter().unzip();
+        let starts =
+            truths.iter().map(|truth| args.search.starts(&args.starts, &model, Some(truth))).collect::<Result<Vec<_>>>()?;
+        queries.push((&files.name, pictures, truths, starts));
+    }
+    let files = ["results.json", "pictures.png"];
+    if let Some(dir) = &args.out {
+        refuse_existing(files.map(|file| dir.join(file)), args.force)?;
+        create_dir(dir)?;
+    }
+    let engine = args.engine.open()?;
+
+    let options = args.search.options();
+    let steps: u64 = options.phases.iter().map(|phase| u64::from(phase.steps)).sum();
+    let bar = progress(steps * instances.len() as u64, "steps");
+    let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();
+    for (i, (name, pictures, truths, starts)) in queries.iter().enumerate() {
+        bar.set_message(name.to_string());
+        let found = search(&engine, &model, side, pictures, starts, &options, |progress| {
+            bar.set_position(i as u64 * steps + u64::from(progress.step));
+            Ok(())
+        })?;
+        let reports = pictures.iter().zip(truths).zip(found);
+        results.extend(reports.map(|((picture, truth), found)| (view_report(name, picture, truth, &found), picture, found)));
+    }
+    bar.finish_and_clear();
+
+    let sheet = args.out.as_ref().map(|_| pictures_sheet(&results, side));
+    let views: Vec<ViewReport> = results.into_iter().map(|(report, ..)| report).collect();
+    let of = |name: &str| Summary::of(name, &views.iter().filter(|view| view.instance == name).collect::<Vec<_>>());
+    let report = Report {
+        model: args.model.clone(),
+        data: args.data.clone(),
+        starts: args.starts.to_string(),
+        executor: engine.to_string(),
+        overall: Summary::of("all", &views.iter().collect::<Vec<_>>()),
+        instances: instances.iter().map(|files| of(&files.name)).collect(),
+        views,
+    };
+    let json = serde_json::to_string_pretty(&report)?;
+    print(&if args.json { json.clone() } else { report.table() })?;
+    if let (Some(dir), Some(sheet)) = (&args.out, sheet) {
+        sigma_srn::write_atomically(&dir.join(files[0]), json.as_bytes())?;
+        write_png(&dir.join(files[1]), &sheet)?;
+        eprintln!("{} in {}", files.join(" and "), dir.display());
+    }
+    Ok(true)
+}
+
+/// `n` of the items, evenly spaced; the first among them.
+fn spread<T>(items: Vec<T>, n: usize) -> Vec<T> {
+    let (len, n) = (items.len(), n.min(items.len()));
+    let chosen: Vec<usize> = (0..n).map(|k| k * len / n).collect();
+    items.into_iter().enumerate().filter(|(i, _)| chosen.contains(i)).map(|(_, item)| item).collect()
+}
+
+fn view_report(instance: &str, picture: &Picture, truth: &DMat4, found: &Found) -> ViewReport {
+    let errors = found.estimate.ranking.iter().map(|r| PoseError::of(&r.pose.to_matrix(), truth));
+    let error = PoseError::of(&found.world_from_camera, truth);
+    ViewReport {
+        instance: instance.into(),
+        view: picture.name.clone(),
+        error,
+        oracle: errors.min_by(|a, b| a.rotation_deg.total_cmp(&b.rotation_deg)).unwrap_or(error),
+        start: found.estimate.ranking[0].start,
+        loss: found.estimate.loss,
+        unexplained: found.unexplained,
+        converged: found.converged(),
+        seconds: found.seconds,
+        world_from_camera: found.world_from_camera.transpose().to_cols_array_2d(),
+    }
+}
+
+/// Target, estimate and difference of every view, the largest rotation error first.
+fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u32) -> image::RgbImage {
+    let mut order: Vec<_> = results.iter().collect();
+    order.sort_by(|a, b| b.0.error.rotation_deg.total_cmp(&a.0.error.rotation_deg));
+    let mut cells = Vec::new();
+    for (report, picture, found) in order {
+        let views = [
+            draw::view(&picture.rgb, side, SHOWN),
+            draw::view(&found.rgb, side, SHOWN),
+            draw::difference(&picture.rgb, &found.rgb, side, SHOWN),
+        ];
+        let mut row = sheet::blank(3 * views[0].width() + 16, views[0].height() + 8);
+        for (view, k) in views.iter().zip(0i64..) {
+            image::imageops::replace(&mut row, view, k * (i64::from(view.width()) + 4), 0);
+        }
+        cells.push((row, format!("{} {}: {} off", report.instance, report.view, report.error)));
+    }
+    let cells: Vec<_> = cells.iter().map(|(row, label)| (row, label.as_str())).collect();
+    let grid = sheet::grid(&cells, COLUMNS);
+    let mut page = sheet::blank(grid.width(), grid.height() + 24);
+    sheet::text(&mut page, 4, 8, "target | view from the estimated pose | difference; the worst first", sheet::BLACK);
+    image::imageops::replace(&mut page, &grid, 0, 24);
+    page
+}
+
+impl Statistics {
+    fn of(values: impl Iterator<Item = f64>) -> Self {
+        let mut values: Vec<f64> = values.collect();
+        values.sort_by(f64::total_cmp);
+        let n = values.len();
+        let median = 0.5 * (values[(n - 1) / 2] + values[n / 2]);
+        Statistics { mean: values.iter().sum::<f64>() / n as f64, median }
+    }
+}
+
+impl Summary {
+    /// Of at least one view.
+    fn of(name: &str, views: &[&ViewReport]) -> Self {
+        let n = views.len() as f64;
+        let part = |limit: f64| views.iter().filter(|view| view.error.rotation_deg <= limit).count() as f64 / n;
+        Summary {
+            name: name.into(),
+            views: views.len(),
+            converged: views.iter().filter(|view| view.converged).count(),
+            rotation_deg: Statistics::of(views.iter().map(|view| view.error.rotation_deg)),
+            translation: Statistics::of(views.iter().map(|view| view.error.translation)),
+            recall_5_deg: part(5.0),
+            recall_10_deg: part(10.0),
+            oracle_deg: Statistics::of(views.iter().map(|view| view.oracle.rotation_deg)),
+            seconds_per_view: views.iter().map(|view| view.seconds).sum::<f64>() / n,
+        }
+    }
+}
+
+impl Report {
+    /// A table in Markdown, aligned.
+    fn table(&self) -> String {
+        let head = [
+            "instance",
+            "views",
+            "rot mean",
+            "median",
+            "<= 5°",
+            "<= 10°",
+            "oracle mean",
+            "median",
+            "tra mean",
+            "median",
+            "converged",
+            "s/view",
+        ];
+        let row = |s: &Summary| {
+            let degrees = |s: Statistics| [s.mean, s.median].map(|x| format!("{x:.2}°"));
+            let [rotation, rotation_median] = degrees(s.rotation_deg);
+            let [oracle, oracle_median] = degrees(s.oracle_deg);
+            let [translation, translation_median] = [s.translation.mean, s.translation.median].map(|x| format!("{x:.3}"));
+            let [recall_5, recall_10] = [s.recall_5_deg, s.recall_10_deg].map(|x| format!("{x:.2}"));
+            [
+                s.name.clone(),
+                s.views.to_string(),
+                rotation,
+                rotation_median,
+                recall_5,
+                recall_10,
+                oracle,
+                oracle_median,
+                translation,
+                translation_median,
+                s.converged.to_string(),
+                format!("{:.2}", s.seconds_per_view),
+            ]
+        };
+        let mut rows = vec![head.map(String::from)];
+        rows.extend(self.instances.iter().chain([&self.overall]).map(row));
+        let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+        let widths: [usize; 12] = std::array::from_fn(width);
+        let line = |row: &[String; 12]| {
+            let cells: Vec<_> = row.iter().zip(widths).map(|(cell, width)| format!(" {cell:>width$} ")).collect();
+            format!("|{}|", cells.join("|"))
+        };
+        let mut lines: Vec<_> = rows.iter().map(line).collect();
+        let rule: Vec<_> = widths.iter().map(|width| "-".repeat(width + 1) + ":").collect();
+        lines.insert(1, format!("|{}|", rule.join("|")));
+        lines.join("\n")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn views_are_spread_evenly() {
+        assert_eq!(spread((0..20).collect(), 4), [0, 5, 10, 15]);
+        assert_eq!(spread((0..3).collect(), 10), [0, 1, 2]);
+        assert_eq!(spread((0..7).collect(), 3), [0, 2, 4]);
+        assert!(spread(Vec::<u8>::new(), 3).is_empty());
+    }
+
+    #[test]
+    fn statistics_of_odd_and_even_counts() {
+        let of = |values: &[f64]| Statistics::of(values.iter().copied());
+        assert_eq!((of(&[3.0, 1.0, 8.0]).mean, of(&[3.0, 1.0, 8.0]).median), (4.0, 3.0));
+        assert_eq!(of(&[4.0, 1.0, 2.0, 9.0]).median, 3.0);
+    }
+}
