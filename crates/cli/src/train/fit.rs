@@ -48,16 +48,15 @@ pub struct FitArgs {
 pub fn fit(args: &FitArgs) -> Result<bool> {
     let is_resumed = args.resume.is_some();
     let run = args.resume.as_ref().or(args.out.as_ref()).ok_or("--out or --resume is needed")?;
-    let (mut settings, engine) = if is_resumed {
+    let mut settings = if is_resumed {
         let mut settings = Settings::read(run)?;
         settings.change(&args.changeable);
-        let engine = args.engine.open_like(&settings.executor, settings.memory)?;
-        (settings, engine)
+        settings
     } else {
         if fs::read_dir(run).is_ok_and(|mut files| files.next().is_some()) {
             return Err(format!("{}: not empty, nothing was overwritten; --resume goes on with a run", run.display()).into());
         }
-        (Settings::new(&args.for_good, &args.changeable)?, args.engine.open()?)
+        Settings::new(&args.for_good, &args.changeable)?
     };
     let set = load(&settings.data, settings.side, settings.views)?;
     let instances: BTreeMap<_, _> = set.instances.iter().map(|i| (i.name.clone(), i.views.len())).collect();
@@ -66,9 +65,10 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         return Err(format!("{}: {what}", settings.data.display()).into());
     }
     settings.instances = instances;
-    (settings.executor, settings.memory) = (engine.to_string(), engine.budget());
     let validation = settings.validation.as_ref().map(|dir| load(dir, settings.side, None)).transpose()?;
     let watched = watched_views(&set, validation.as_ref(), settings.validation_views as usize)?;
+    let engine = if is_resumed { args.engine.open_like(&settings.executor, settings.memory)? } else { args.engine.open()? };
+    (settings.executor, settings.memory) = (engine.to_string(), engine.budget());
 
     let mut model = Model::init(&settings.model(), settings.seed)?;
     let instance_names = settings.instances.keys().cloned().collect();

@@ -1,0 +1,267 @@
+//! `sigma-train` as a user runs it: killed and resumed runs, exit codes, what is written, what is never overwritten.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
+
+use serde_json::Value;
+use sigma_srn::Model;
+
+const TRAIN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/dataset/train");
+const TEST: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/dataset/test");
+
+/// A run of seconds.
+const TINY: &str = "--hidden 16 --latent 8 --tracing-steps 3 --side 16 --views 3 --batch 3 --rays 40 --log-every 1 \
+                    --validate-every 25 --validation-views 2 --checkpoint-every 7";
+
+fn command(args: &str) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sigma-train"));
+    command.args(args.split_whitespace());
+    command
+}
+
+fn sigma_train(args: &str) -> Output {
+    command(args).output().unwrap()
+}
+
+#[track_caller]
+fn succeed(args: &str) -> String {
+    let output = sigma_train(args);
+    assert_eq!(output.status.code(), Some(0), "{args}\n{}", stderr(&output));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[track_caller]
+fn fail(args: &str, words: &[&str]) {
+    let output = sigma_train(args);
+    let message = stderr(&output);
+    assert_eq!(output.status.code(), Some(2), "{args}\n{message}");
+    assert!(words.iter().all(|word| message.contains(word)), "{args}\n{message}");
+    // Graphics drivers have their own opinion on this variable.
+    let errors = message.lines().filter(|line| line.starts_with("error") && !line.contains("XDG_RUNTIME_DIR"));
+    assert!(output.stdout.is_empty() && errors.count() == 1, "{message}");
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// The metadata and tensor table of a safetensors file, and its numbers.
+fn content(path: &Path) -> (Value, Vec<u8>) {
+    let bytes = fs::read(path).unwrap();
+    let header = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    (serde_json::from_slice(&bytes[8..8 + header]).unwrap(), bytes[8 + header..].to_vec())
+}
+
+/// The lines of a run's metrics, without the times.
+fn metrics(run: &Path) -> Vec<Value> {
+    let text = fs::read_to_string(run.join("metrics.jsonl")).unwrap();
+    let untimed = |line| {
+        let mut value: Value = serde_json::from_str(line).unwrap();
+        value.as_object_mut().unwrap().remove("seconds").unwrap();
+        value
+    };
+    text.lines().map(untimed).collect()
+}
+
+fn assert_same_run(one: &Path, other: &Path) {
+    for file in ["model.safetensors", "checkpoint.safetensors"] {
+        assert!(content(&one.join(file)) == content(&other.join(file)), "{file} differs");
+    }
+    assert_eq!(metrics(one), metrics(other));
+    for file in ["curves.png", "samples/step_000025.png"] {
+        assert!(fs::read(one.join(file)).unwrap() == fs::read(other.join(file)).unwrap(), "{file} differs");
+    }
+}
+
+/// Starts a command, and lets `end` act on it once its run has logged `lines` lines.
+fn interrupt(args: &str, run: &Path, lines: usize, end: impl Fn(&mut std::process::Child)) -> Output {
+    let mut child = command(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let logged = || fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default().lines().count();
+    while logged() < lines && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    end(&mut child);
+    child.wait_with_output().unwrap()
+}
+
+/// Done when 4 of the main job: a run killed at any moment ends with the same bits.
+fn killed_and_resumed(executor: &str) {
+    let dir = tempfile::tempdir().unwrap();
+    let [whole, cut] = ["whole", "cut"].map(|name| dir.path().join(name));
+    let start = |run: &Path| {
+        format!("fit --data {TRAIN} --validation {TEST} --out {} {TINY} --steps 60 --executor {executor}", run.display())
+    };
+    succeed(&start(&whole));
+    assert_eq!(metrics(&whole).len(), 60);
+    // Before the first checkpoint, then between two, then again.
+    let resume = format!("fit --resume {}", cut.display());
+    for (command, lines) in [(&start(&cut), 2), (&resume, 17), (&resume, 38)] {
+        let output = interrupt(command, &cut, lines, |child| child.kill().unwrap());
+        assert_eq!(output.status.code(), None, "it should have been killed: {}", stderr(&output));
+        assert!(!cut.join("model.safetensors").exists());
+    }
+    // A line cut short, as by a power failure.
+    fs::write(cut.join("metrics.jsonl"), fs::read_to_string(cut.join("metrics.jsonl")).unwrap() + "{\"step\":3").unwrap();
+    succeed(&resume);
+    assert_same_run(&whole, &cut);
+    // Resuming what is complete changes nothing.
+    succeed(&resume);
+    assert_same_run(&whole, &cut);
+}
+
+#[test]
+fn a_killed_run_resumes_to_the_same_bits_on_the_cpu() {
+    killed_and_resumed("cpu");
+}
+
+#[test]
+fn a_killed_run_resumes_to_the_same_bits_on_the_gpu() {
+    killed_and_resumed("gpu");
+}
+
+#[cfg(unix)]
+#[test]
+fn ctrl_c_saves_and_says_how_to_go_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let [whole, cut] = ["whole", "cut"].map(|name| dir.path().join(name));
+    let start = |run: &Path| format!("fit --data {TRAIN} --out {} {TINY} --steps 200 --executor cpu", run.display());
+    let stopped = interrupt(&start(&cut), &cut, 5, |child| {
+        Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    });
+    assert_eq!(stopped.status.code(), Some(1), "{}", stderr(&stopped));
+    let resume = format!("fit --resume {}", cut.display());
+    assert!(stderr(&stopped).contains(&format!("sigma-train {resume}")), "{}", stderr(&stopped));
+    let done = content(&cut.join("checkpoint.safetensors")).0["__metadata__"]["steps"].as_str().unwrap().parse::<usize>();
+    assert!((5..200).contains(&done.unwrap()));
+    succeed(&resume);
+    succeed(&start(&whole));
+    assert_same_run(&whole, &cut);
+}
+
+#[test]
+fn training_learns_and_writes_what_a_person_wants_to_see() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    let fit = format!(
+        "fit --data {TRAIN} --out {} --hidden 16 --latent 8 --tracing-steps 3 --side 16 --views 3 --batch 9 --rays 128 \
+         --steps 300 --lr 5e-3 --decay-from 250 --log-every 50 --validate-every 150 --plain-srn --executor cpu --json",
+        run.display()
+    );
+    let result: Value = serde_json::from_str(&succeed(&fit)).unwrap();
+    assert_eq!((&result["last"]["step"], &result["unseen_views"]), (&300.into(), &false.into()));
+
+    let lines = metrics(&run);
+    assert_eq!(lines.iter().map(|line| line["step"].as_u64().unwrap()).collect::<Vec<_>>(), [50, 100, 150, 200, 250, 300]);
+    let number = |line: &Value, key: &str| line[key].as_f64().unwrap();
+    assert!(number(&lines[5], "loss") < 0.5 * number(&lines[0], "loss"), "{lines:?}");
+    assert!(number(&lines[5], "validation_psnr") > 13.0, "{lines:?}");
+    assert!(lines[0].get("validation_psnr").is_none());
+    assert_eq!(lines.iter().map(|line| number(line, "learning_rate")).collect::<Vec<_>>()[4..], [5e-3, 5e-4]);
+    for picture in ["samples/step_000150.png", "samples/step_000300.png", "curves.png"] {
+        assert!(image::open(run.join(picture)).unwrap().width() > 250, "{picture}");
+    }
+    let model = Model::load(&run.join("model.safetensors")).unwrap();
+    assert!(model.layout.density.is_none() && model.layout.features() == 16);
+    assert_eq!((model.metadata.side, model.metadata.instance_names.len()), (Some(16), 9));
+    assert!((model.metadata.orbit_radius.unwrap() - 1.3).abs() < 1e-3);
+}
+
+#[test]
+fn divergence_is_named_and_leaves_the_checkpoint() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    succeed(&format!("fit --data {TRAIN} --out {} {TINY} --steps 10 --executor cpu", run.display()));
+    let before = content(&run.join("checkpoint.safetensors"));
+    fail(&format!("fit --resume {} --steps 40 --lr 1e30 --decay 1", run.display()), &["step 1", "not finite"]);
+    assert!(content(&run.join("checkpoint.safetensors")) == before, "the last good checkpoint");
+    succeed(&format!("fit --resume {} --steps 20 --lr 1e-4", run.display()));
+    assert_eq!(metrics(&run).len(), 20);
+}
+
+#[test]
+fn bad_calls_end_with_2_and_one_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name).display().to_string();
+    let (run, used, set) = (at("run"), at("used"), at("set"));
+    fs::create_dir(&used).unwrap();
+    fs::write(format!("{used}/thesis.tex"), "mine").unwrap();
+    for folder in ["rgb", "pose"] {
+        fs::create_dir_all(format!("{set}/cup/{folder}")).unwrap();
+    }
+    for (args, words) in [
+        (format!("fit --data {TRAIN} --out {used} {TINY}"), &["used", "not empty", "--resume"][..]),
+        (format!("fit --data {TRAIN}/nothing --out {run}"), &["nothing"]),
+        (format!("fit --data {set} --out {run}"), &["cup", "intrinsics.txt"]),
+        (format!("fit --data {TRAIN} --validation {set} --out {run} --side 16 --views 1"), &["intrinsics.txt"]),
+        (format!("fit --data {TRAIN}/seat --validation {TEST} --out {run} --side 16"), &["--validation", "bucket"]),
+        (format!("fit --data {TRAIN} --out {run} --side 8 --rays 65"), &["--rays 65", "64 pixels"]),
+        (format!("fit --data {TRAIN} --out {run} --hidden 0"), &["--hidden"]),
+        (format!("fit --data {TRAIN} --out {run} --lr 0"), &["--lr", "positive"]),
+        (format!("fit --data {TRAIN} --out {run} --memory much"), &["--memory", "bytes"]),
+        (format!("fit --data {TRAIN} --out {run} --adapter none-such --side 8 --views 1"), &["none-such", "found"]),
+        (format!("fit --data {TRAIN} --out {run} {TINY} --executor cpu --memory 100kB"), &["memory budget"]),
+        (format!("fit --out {run}"), &["--data"]),
+        (format!("fit --data {TRAIN}"), &["--out"]),
+        (format!("fit --resume {run}"), &["config.json", "no run"]),
+        (format!("fit --resume {run} --out {run}"), &["--out"]),
+        (format!("fit --resume {run} --hidden 16"), &["--hidden", "--resume"]),
+        (format!("adapt --model {run}/model.safetensors --data {TEST} --out {at_m}", at_m = at("m")), &["model.safetensors"]),
+        (format!("adapt --model {used}/thesis.tex --data {TEST} --out {at_m}", at_m = at("m")), &["thesis.tex"]),
+        (format!("adapt --model {used}/thesis.tex --data {TEST} --out {used}/thesis.tex"), &["exists already"]),
+        (format!("adapt --model {used}/thesis.tex --data {TEST} --out {run}/m"), &["folder does not exist"]),
+    ] {
+        fail(&args, words);
+        assert!(!Path::new(&run).exists(), "{args}");
+    }
+    assert_eq!(fs::read_to_string(format!("{used}/thesis.tex")).unwrap(), "mine");
+}
+
+#[test]
+fn a_resumed_run_must_find_what_it_began_with() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run").display().to_string();
+    succeed(&format!("fit --data {TRAIN} --out {run} {TINY} --steps 8 --executor cpu"));
+    fail(&format!("fit --resume {run} --data {TRAIN}/seat"), &["seat", "other instances"]);
+    fail(&format!("fit --resume {run} --steps 5"), &["--steps 5", "8"]);
+    let checkpoint = format!("{run}/checkpoint.safetensors");
+    let whole = fs::read(&checkpoint).unwrap();
+    fs::write(&checkpoint, &whole[..whole.len() / 2]).unwrap();
+    fail(&format!("fit --resume {run}"), &["checkpoint.safetensors"]);
+    fs::write(&checkpoint, &whole).unwrap();
+    let config = format!("{run}/config.json");
+    fs::write(&config, fs::read_to_string(&config).unwrap().replace("\"hidden\": 16", "\"hidden\": 17")).unwrap();
+    fail(&format!("fit --resume {run}"), &["checkpoint.safetensors", "sizes"]);
+    fs::write(&config, "{").unwrap();
+    fail(&format!("fit --resume {run}"), &["config.json"]);
+}
+
+#[test]
+fn adapt_fits_codes_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let (run, new) = (at("run"), at("new.safetensors"));
+    succeed(&format!("fit --data {TRAIN} --out {} {TINY} --steps 100 --lr 2e-3 --executor cpu", run.display()));
+    let old = run.join("model.safetensors");
+    let adapt = format!("adapt --model {} --data {TEST}/seat --executor cpu --steps 40 --out", old.display());
+    let result: Value = serde_json::from_str(&succeed(&format!("{adapt} {} --json", new.display()))).unwrap();
+    let seat = &result["instances"][0];
+    assert_eq!(seat["instance"], "seat");
+    assert!(seat["fitted_psnr"].as_f64().unwrap() > 5.0 && seat["unseen_psnr"].as_f64().unwrap() > 5.0, "{seat}");
+
+    let [old, adapted] = [&old, &new].map(|path| Model::load(path).unwrap());
+    assert_eq!((adapted.metadata.instance_names.as_slice(), adapted.metadata.side), (&["seat".to_string()][..], Some(16)));
+    let codes = old.layout.codes;
+    for (number, (before, after)) in old.parameters.iter().zip(&adapted.parameters).enumerate() {
+        assert_eq!(before.values == after.values, number != codes, "{:?}", before.tensors);
+    }
+    assert_ne!(old.with_new_instances(vec!["seat".into()]).parameters[codes], adapted.parameters[codes]);
+
+    fail(&format!("{adapt} {}", new.display()), &["new.safetensors", "exists already"]);
+    let other = at("other").display().to_string();
+    fail(&format!("{adapt} {other} --view 000000 --view nothing"), &["--view nothing", "seat"]);
+    fail(&format!("{adapt} {other} --views 1000"), &["--views 1000", "seat"]);
+    assert!(!at("other").exists());
+    assert!(succeed(&format!("{adapt} {other} --view 000003")).contains("seat"));
+}
