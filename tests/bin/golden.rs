@@ -49,16 +49,8 @@ fn run() -> Result<bool, String> {
         let name = file.file_stem().unwrap_or_default().to_string_lossy();
         for (engine_name, engine, limits) in &engines {
             for figure in check(engine, file, *limits)? {
-                let pass = figure.worst <= figure.limit;
-                all_pass &= pass;
-                println!(
-                    "{name:<14} {engine_name:<6} {:<20} {:>9.1e} {:>9.0e}  {}{}",
-                    figure.quantity,
-                    figure.worst,
-                    figure.limit,
-                    figure.tensor,
-                    if pass { "" } else { "  EXCEEDS ITS LIMIT" }
-                );
+                all_pass &= figure.passes();
+                println!("{name:<14} {engine_name:<6} {figure}");
             }
         }
     }

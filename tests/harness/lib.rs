@@ -1,11 +1,13 @@
 //! This crate owns what tests share: the comparison of results, the device, plans with random inputs, and lockstep.
 //! It does not know single kernels, nor the model.
 
-pub mod golden;
+pub mod between;
 mod case;
 mod close;
 mod device;
+pub mod golden;
 mod lockstep;
+pub mod table;
 
 pub use case::{Case, Sketch};
 pub use close::{assert_close, difference};
