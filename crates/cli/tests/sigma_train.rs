@@ -150,7 +150,7 @@ fn training_learns_and_writes_what_a_person_wants_to_see() {
         run.display()
     );
     let result: Value = serde_json::from_str(&succeed(&fit)).unwrap();
-    assert_eq!((&result["last"]["step"], &result["unseen_views"]), (&300.into(), &false.into()));
+    assert_eq!((&result["steps"], &result["views"]), (&300.into(), &"training".into()));
 
     let lines = metrics(&run);
     assert_eq!(lines.iter().map(|line| line["step"].as_u64().unwrap()).collect::<Vec<_>>(), [50, 100, 150, 200, 250, 300]);
@@ -198,6 +198,8 @@ fn bad_calls_end_with_2_and_one_line() {
         (format!("fit --data {TRAIN}/seat --validation {TEST} --out {run} --side 16"), &["--validation", "bucket"]),
         (format!("fit --data {TRAIN} --out {run} --side 8 --rays 65"), &["--rays 65", "64 pixels"]),
         (format!("fit --data {TRAIN} --out {run} --hidden 0"), &["--hidden"]),
+        (format!("fit --data {TRAIN} --out {run} --side 5000"), &["--side", "4096"]),
+        (format!("fit --data {TRAIN} --out {run} --batch 100000 --rays 4096"), &["--batch × --rays"]),
         (format!("fit --data {TRAIN} --out {run} --lr 0"), &["--lr", "positive"]),
         (format!("fit --data {TRAIN} --out {run} --memory much"), &["--memory", "bytes"]),
         (format!("fit --data {TRAIN} --out {run} --adapter none-such --side 8 --views 1"), &["none-such", "found"]),

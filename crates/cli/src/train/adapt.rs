@@ -7,7 +7,7 @@ use serde::Serialize;
 use sigma_srn::{Model, Train, Trainer, stream};
 use srn_data::{Instance, LoadedView};
 
-use super::settings::{at_least_1, positive};
+use super::settings::{positive, up_to};
 use super::{Shown, psnr_of_each, render, training_batch};
 use crate::common::{self, EngineArgs, Result};
 
@@ -27,7 +27,7 @@ pub struct AdaptArgs {
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Fit to the first views of each instance, this many.
-    #[arg(long, value_name = "N", default_value_t = 2, value_parser = at_least_1())]
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = up_to(u32::MAX))]
     views: u32,
     /// Fit to the view of this name; may be repeated.
     #[arg(long, value_name = "NAME", conflicts_with = "views")]
@@ -39,10 +39,10 @@ pub struct AdaptArgs {
     #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive)]
     lr: f64,
     /// Random rays per image and step, at most a whole image.
-    #[arg(long, value_name = "N", default_value_t = 1024, value_parser = at_least_1())]
+    #[arg(long, value_name = "N", default_value_t = 1024, value_parser = up_to(u32::MAX))]
     rays: u32,
     /// Side of the images in pixels [the model's].
-    #[arg(long, value_name = "PIXELS", value_parser = at_least_1())]
+    #[arg(long, value_name = "PIXELS", value_parser = up_to(4096))]
     side: Option<u32>,
     /// Decides the random rays.
     #[arg(long, value_name = "N", default_value_t = 0)]

@@ -13,7 +13,7 @@ use image::RgbImage;
 use indicatif::{HumanDuration, ProgressBar};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use sigma_srn::{Engine, Losses, Metadata, Model, Train, Trainer, stream, write_atomically};
+use sigma_srn::{Engine, Losses, Metadata, Model, Random, Train, Trainer, stream, write_atomically};
 use srn_data::{Dataset, SrnSet, pixels, sheet};
 
 use super::{Changeable, ForGood, Settings, Shown, psnr_of_each, render, training_batch};
@@ -23,9 +23,12 @@ use crate::common::{self, EngineArgs, Result};
 const CHECKPOINT_INTERVAL: Duration = Duration::from_secs(60);
 /// Time between lines of progress where stderr is no terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
+/// Time after which the loss on the terminal is old.
+const STALE: Duration = Duration::from_secs(2);
 
 /// Flags of `sigma-train fit`.
 #[derive(Args, Debug)]
+#[command(override_usage = "sigma-train fit --data <DIR> --out <RUN> [OPTIONS]\n       sigma-train fit --resume <RUN> [OPTIONS]")]
 pub struct FitArgs {
     /// Folder of the run, made here: model, checkpoint, metrics, sample images.
     #[arg(long, value_name = "RUN", required_unless_present = "resume")]
@@ -71,12 +74,10 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     (settings.executor, settings.memory) = (engine.to_string(), engine.budget());
 
     let mut model = Model::init(&settings.model(), settings.seed)?;
-    let instance_names = settings.instances.keys().cloned().collect();
+    let instance_names = set.instances.iter().map(|instance| instance.name.clone()).collect();
     let orbit_radius = median_distance(&set);
     model.metadata = Metadata { instance_names, side: Some(settings.side), orbit_radius: Some(orbit_radius) };
     let mut trainer = Trainer::new(&engine, model, Train::Everything, settings.batch, settings.rays)?;
-    let samples = run.join("samples");
-    fs::create_dir_all(&samples).map_err(|error| format!("{}: {error}", samples.display()))?;
     let checkpoint = run.join("checkpoint.safetensors");
     // A run that was killed before its first checkpoint begins again.
     if is_resumed && checkpoint.exists() {
@@ -85,7 +86,10 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     if trainer.steps() > settings.steps {
         return Err(format!("--steps {}: the run has done {} already", settings.steps, trainer.steps()).into());
     }
+    fs::create_dir_all(run).map_err(|error| format!("{}: {error}", run.display()))?;
     settings.write(run)?;
+    let samples = run.join("samples");
+    fs::create_dir_all(&samples).map_err(|error| format!("{}: {error}", samples.display()))?;
     let mut metrics = Metrics::open(run.join("metrics.jsonl"), trainer.steps())?;
 
     let stop = stop_on_signal()?;
@@ -96,28 +100,26 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         let learning_rate = settings.learning_rate(step);
         // Everything random comes from seed and step: a resumed run needs no memory of it.
         let mut random = stream(settings.seed, step);
-        let views: Vec<Shown> = (0..settings.batch)
-            .map(|_| {
-                let instance = random.random_range(0..set.instances.len());
-                let views = &set.instances[instance].views;
-                (instance as u32, &views[random.random_range(0..views.len())])
-            })
-            .collect();
+        let views = draw_views(&set, settings.batch, &mut random);
         trainer.step(&training_batch(&views, settings.side, settings.rays, &mut random), learning_rate)?;
         meter.bar.inc(1);
 
         let is_due = |every: u64| step.is_multiple_of(every) || step == settings.steps;
-        if is_due(settings.log_every) || is_due(settings.validate_every) {
+        let is_logged = is_due(settings.log_every) || is_due(settings.validate_every);
+        // Reading waits for the device, so not every step.
+        if is_logged || meter.is_stale() {
             let losses = trainer.losses()?;
-            let mut record = Record::new(step, &losses, learning_rate, meter.seconds());
             let rays_per_second = meter.rays_per_second(step);
-            if is_due(settings.validate_every) {
-                let (psnr, picture) = look(&engine, trainer.model()?, &watched, settings.side, orbit_radius)?;
-                let path = samples.join(format!("step_{step:06}.png"));
-                picture.save(&path).map_err(|error| format!("{}: {error}", path.display()))?;
-                record.validation_psnr = Some(psnr);
+            if is_logged {
+                let mut record = Record::new(step, &losses, learning_rate, meter.seconds());
+                if is_due(settings.validate_every) {
+                    let (psnr, picture) = look(&engine, trainer.model()?, &watched, settings.side, orbit_radius)?;
+                    let path = samples.join(format!("step_{step:06}.png"));
+                    picture.save(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+                    record.validation_psnr = Some(psnr);
+                }
+                metrics.push(record)?;
             }
-            metrics.push(record)?;
             meter.show(step, &losses, rays_per_second, metrics.validation_psnr());
         }
         if checkpointed.elapsed() > CHECKPOINT_INTERVAL || settings.checkpoint_every.is_some_and(is_due) {
@@ -136,14 +138,13 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     trainer.model()?.save(&model)?;
     let curves = run.join("curves.png");
     metrics.curves().save(&curves).map_err(|error| format!("{}: {error}", curves.display()))?;
-    let last = metrics.last().ok_or("no step was done")?;
+    let (steps, psnr) = (trainer.steps(), metrics.validation_psnr());
+    let which = if validation.is_some() { "unseen" } else { "training" };
     if args.json {
-        let result = serde_json::json!({ "model": model, "unseen_views": validation.is_some(), "last": last });
+        let result = serde_json::json!({ "model": model, "steps": steps, "views": which, "validation_psnr": psnr });
         println!("{result:#}");
     } else {
-        let which = if validation.is_some() { "unseen" } else { "training" };
-        let psnr = last.validation_psnr.unwrap_or(f64::NAN);
-        println!("PSNR {psnr:.2} dB on {} {which} views after {} steps", watched.len(), last.step);
+        println!("PSNR {:.2} dB on {} {which} views after {steps} steps", psnr.unwrap_or(f64::NAN), watched.len());
         println!("model: {}", model.display());
     }
     Ok(true)
@@ -156,6 +157,17 @@ fn load(dir: &Path, side: u32, views: Option<usize>) -> Result<Dataset> {
         instance.views.truncate(views.unwrap_or(usize::MAX));
     }
     Ok(set.load(side as usize)?)
+}
+
+/// Random instances, and of each a random view.
+fn draw_views<'a>(set: &'a Dataset, count: u32, random: &mut Random) -> Vec<Shown<'a>> {
+    (0..count)
+        .map(|_| {
+            let instance = random.random_range(0..set.instances.len());
+            let views = &set.instances[instance].views;
+            (instance as u32, &views[random.random_range(0..views.len())])
+        })
+        .collect()
 }
 
 /// The views of a validation: from every instance in turn, spread over its views.
@@ -306,8 +318,8 @@ struct Meter {
     /// Step and time from which the speed is measured.
     since: (u64, Instant),
     last_line: Option<Instant>,
-    /// Mean of the image loss over about the last ten readings.
-    image_loss: Option<f64>,
+    /// Mean of the image loss over about the last ten readings, and their number.
+    image_loss: (f64, u32),
 }
 
 impl Meter {
@@ -324,7 +336,7 @@ impl Meter {
             seconds_before,
             since: (step, now),
             last_line: None,
-            image_loss: None,
+            image_loss: (0.0, 0),
         }
     }
 
@@ -338,9 +350,14 @@ impl Meter {
         ((step - self.since.0) * self.rays_per_step) as f64 / self.since.1.elapsed().as_secs_f64()
     }
 
+    fn is_stale(&self) -> bool {
+        self.since.1.elapsed() > STALE
+    }
+
     fn show(&mut self, step: u64, losses: &Losses, rays_per_second: f64, validation_psnr: Option<f64>) {
-        let image = self.image_loss.map_or(losses.image, |mean| 0.9 * mean + 0.1 * losses.image);
-        self.image_loss = Some(image);
+        let (mean, readings) = self.image_loss;
+        let image = mean + (losses.image - mean) / f64::from(readings + 1).min(10.0);
+        self.image_loss = (image, readings + 1);
         let psnr = Losses { image, ..*losses }.psnr();
         let validation = validation_psnr.map_or(String::new(), |psnr| format!(", validation {psnr:.2} dB"));
         let message = format!("loss {:.3}, PSNR {psnr:.2} dB{validation}, {rays_per_second:.0} rays/s", losses.total());

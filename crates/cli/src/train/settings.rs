@@ -77,28 +77,28 @@ pub struct ForGood {
     #[arg(long, value_enum)]
     preset: Option<Preset>,
     /// Features of the networks [compact 64, paper 256].
-    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    #[arg(long, value_name = "N", value_parser = up_to(4096))]
     hidden: Option<u32>,
     /// Length of a latent code [compact 32, paper 256].
-    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    #[arg(long, value_name = "N", value_parser = up_to(4096))]
     latent: Option<u32>,
     /// Marching steps along a ray [10].
-    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    #[arg(long, value_name = "N", value_parser = up_to(1000))]
     tracing_steps: Option<u32>,
     /// Plain SRN, the baseline: no density net, the colour comes from the end point alone.
     #[arg(long)]
     plain_srn: bool,
     /// Images are cut to squares and resampled to this side, in pixels [64].
-    #[arg(long, value_name = "PIXELS", value_parser = at_least_1())]
+    #[arg(long, value_name = "PIXELS", value_parser = up_to(4096))]
     side: Option<u32>,
     /// Use only the first views of each instance, this many [compact all, paper 50].
-    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    #[arg(long, value_name = "N", value_parser = up_to(u32::MAX))]
     views: Option<u32>,
     /// Images per step [10].
-    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    #[arg(long, value_name = "N", value_parser = up_to(100000))]
     batch: Option<u32>,
     /// Random rays per image; side² takes whole images [compact 512, paper side²].
-    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    #[arg(long, value_name = "N", value_parser = up_to(u32::MAX))]
     rays: Option<u32>,
     /// Decides the first weights and every draw [0].
     #[arg(long, value_name = "N")]
@@ -110,7 +110,7 @@ pub struct ForGood {
     #[arg(long, value_name = "STEPS", value_parser = clap::value_parser!(u64).range(1..))]
     validate_every: Option<u64>,
     /// Views of a validation, spread over the set [16].
-    #[arg(long, value_name = "N", value_parser = at_least_1())]
+    #[arg(long, value_name = "N", value_parser = up_to(1000))]
     validation_views: Option<u32>,
     /// Steps between checkpoints, besides one every minute.
     #[arg(long, value_name = "STEPS", value_parser = clap::value_parser!(u64).range(1..))]
@@ -140,8 +140,8 @@ pub struct Changeable {
     decay_from: Option<u64>,
 }
 
-pub(super) fn at_least_1() -> clap::builder::RangedI64ValueParser<u32> {
-    clap::value_parser!(u32).range(1..)
+pub(super) fn up_to(most: u32) -> clap::builder::RangedI64ValueParser<u32> {
+    clap::value_parser!(u32).range(1..=i64::from(most))
 }
 
 pub(super) fn positive(text: &str) -> std::result::Result<f64, String> {
@@ -194,6 +194,15 @@ impl Settings {
         settings.rays = for_good.rays.unwrap_or(if is_paper { pixels } else { 512.min(pixels) });
         if settings.rays > pixels {
             return Err(format!("--rays {}: an image of side {} has {pixels} pixels", settings.rays, settings.side).into());
+        }
+        // Numbers of values are u32 in the kernels.
+        for (flags, values) in [
+            ("--batch × --rays", [settings.batch, settings.rays, 3]),
+            ("--latent × --hidden²", [settings.latent, settings.hidden, settings.hidden]),
+        ] {
+            if values.map(u64::from).iter().product::<u64>() > 1 << 30 {
+                return Err(format!("{flags}: too large").into());
+            }
         }
         settings.change(changeable);
         settings.decay_from = changeable.decay_from.unwrap_or(settings.steps * 4 / 5);
