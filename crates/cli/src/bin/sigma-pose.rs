@@ -8,7 +8,7 @@ use sigma_cli::pose::{estimate, evaluate, render};
 
 /// Camera poses of pictures by gradient descent through a neural renderer.
 ///
-/// Exit status: 0 done, 1 a pose was not found, 2 an error.
+/// Exit status: 0 done, 1 `estimate` did not find a pose, 2 an error.
 #[derive(Parser)]
 #[command(version, about)]
 struct Cli {
@@ -18,7 +18,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Find the poses of pictures. Exit status 1 if a render from the pose found still leaves half of its picture unexplained.
+    /// Find the poses of pictures. Exit status 1 if one of them is not found; see --accept.
     Estimate(estimate::Estimate),
     /// Measure the errors on a data set, by the paper's protocol.
     Evaluate(evaluate::Evaluate),

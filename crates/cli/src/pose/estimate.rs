@@ -10,7 +10,7 @@ use sigma_srn::{Engine, Model};
 
 use super::files::{CameraArgs, Picture, PoseSource, create_dir, load_model, model_side, print, refuse_existing};
 use super::record::Log;
-use super::search::{Found, PoseError, SearchArgs, Starts, search};
+use super::search::{Found, PoseError, SearchArgs, Starts};
 use crate::common::{EngineArgs, Result, progress};
 
 /// Flags of `sigma-pose estimate`.
@@ -112,7 +112,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let options = args.search.options();
     let bar = progress(options.phases.iter().map(|phase| u64::from(phase.steps)).sum(), "steps");
     let mut log = Log::default();
-    let found = search(&engine, &model, side, &pictures, &starts, &options, |mut progress| {
+    let found = args.search.run(&engine, &model, side, &pictures, &starts, |mut progress| {
         bar.set_position(progress.step.into());
         if args.record.is_some() { log.note(&mut progress) } else { Ok(()) }
     })?;
@@ -130,7 +130,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
         }
         eprintln!("pictures in {}", dir.display());
     }
-    Ok(found.iter().all(Found::converged))
+    Ok(found.iter().all(|found| found.converged))
 }
 
 /// One pose per image from none, one or as many sources.
@@ -174,7 +174,7 @@ fn report(args: &Estimate, engine: &Engine, model: &Model, pictures: &[Picture],
             translation: [x, y, z],
             loss: found.estimate.loss,
             unexplained: found.unexplained,
-            converged: found.converged(),
+            converged: found.converged,
             start: found.estimate.ranking[0].start,
             error: error(&found.world_from_camera),
             ranking: found.estimate.ranking.iter().map(ranked).collect(),

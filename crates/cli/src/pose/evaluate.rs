@@ -10,7 +10,7 @@ use srn_data::srn::{InstanceFiles, SrnSet};
 
 use super::draw;
 use super::files::{Picture, create_dir, load_model, model_side, print, refuse_existing, write_png};
-use super::search::{Found, PoseError, SearchArgs, Starts, search};
+use super::search::{Found, PoseError, SearchArgs, Starts};
 use crate::common::{EngineArgs, Result, camera, progress};
 
 /// Side of a view on the sheet, pixels.
@@ -151,7 +151,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();
     for (i, (name, pictures, truths, starts)) in queries.iter().enumerate() {
         bar.set_message(name.to_string());
-        let found = search(&engine, &model, side, pictures, starts, &options, |progress| {
+        let found = args.search.run(&engine, &model, side, pictures, starts, |progress| {
             bar.set_position(i as u64 * steps + u64::from(progress.step));
             Ok(())
         })?;
@@ -200,7 +200,7 @@ fn view_report(instance: &str, picture: &Picture, truth: &DMat4, found: &Found) 
         start: found.estimate.ranking[0].start,
         loss: found.estimate.loss,
         unexplained: found.unexplained,
-        converged: found.converged(),
+        converged: found.converged,
         seconds: found.seconds,
         world_from_camera: found.world_from_camera.transpose().to_cols_array_2d(),
     }

@@ -162,7 +162,7 @@ impl Page<'_> {
             ];
             let shown = views[0].1.width();
             let width = GAP + 3 * (shown + GAP);
-            let top = 62;
+            let top = 68;
             let mut page = sheet::blank(width, top + shown + 22 + 140);
             self.headline(&mut page, 1);
             for (i, (heading, view)) in views.iter().enumerate() {
@@ -180,7 +180,7 @@ impl Page<'_> {
     }
 
     fn headline(&self, page: &mut RgbImage, scale: u32) {
-        let verdict = if self.found.converged() { "pose found" } else { "not converged" };
+        let verdict = if self.found.converged { "pose found" } else { "not converged" };
         sheet::title(page, GAP as i32, 12, &format!("{}: {verdict}", self.picture.name), scale, BLACK);
         let starts = self.found.estimate.ranking.len();
         let mut line = format!("start {} of {starts}", self.found.estimate.ranking[0].start);

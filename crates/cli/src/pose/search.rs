@@ -14,8 +14,6 @@ use super::files::Picture;
 use super::positive;
 use crate::common::Result;
 
-/// An estimate has converged if its render leaves less than this part of the picture unexplained ([`Found::unexplained`]).
-const CONVERGED_BELOW: f64 = 0.5;
 /// Views that are rendered at once.
 const RENDER_BATCH: usize = 8;
 
@@ -48,6 +46,10 @@ pub struct SearchArgs {
     /// Decides the random initial depths of the rays.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// A pose counts as found if the view from there leaves at most this part of the picture unexplained: the sum of absolute
+    /// differences, over that to an empty picture. (What looks alike from two sides can be found from the wrong one.)
+    #[arg(long, value_name = "X", default_value_t = 0.5, value_parser = positive)]
+    accept: f64,
     /// Distance of the starts of `fixed24` from the object's centre, in object units. Default: as the model was trained.
     #[arg(long, value_name = "R", value_parser = positive)]
     radius: Option<f64>,
@@ -121,6 +123,40 @@ impl SearchArgs {
         Options { loss: self.loss, seed: self.seed, ..options }
     }
 
+    /// Estimates the poses of `pictures`, all of `side` pixels, each from its own starts.
+    pub fn run(
+        &self,
+        engine: &Engine,
+        model: &Model,
+        side: u32,
+        pictures: &[Picture],
+        starts: &[Vec<DMat4>],
+        observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
+    ) -> Result<Vec<Found>> {
+        let query = |(picture, starts): (&Picture, &Vec<DMat4>)| Query {
+            instance: picture.instance,
+            rgb: picture.rgb.clone(),
+            width: side,
+            height: side,
+            intrinsics: picture.intrinsics,
+            starts: starts.clone(),
+        };
+        let queries: Vec<_> = pictures.iter().zip(starts).map(query).collect();
+        let began = Instant::now();
+        let estimates = estimate(engine, model, &queries, &self.options(), observe)?;
+        let seconds = began.elapsed().as_secs_f64() / pictures.len() as f64;
+
+        let view = |(picture, found): (&Picture, &Estimate)| (picture.instance, found.pose.to_matrix(), picture.intrinsics);
+        let views: Vec<View> = pictures.iter().zip(&estimates).map(view).collect();
+        let renders = render(engine, model, side, &views)?;
+        let found = estimates.into_iter().zip(renders).zip(pictures).map(|((estimate, render), picture)| {
+            let unexplained = unexplained(&picture.rgb, &render.rgb);
+            let converged = unexplained <= self.accept;
+            Found { world_from_camera: estimate.pose.to_matrix(), estimate, rgb: render.rgb, unexplained, converged, seconds }
+        });
+        Ok(found.collect())
+    }
+
     /// The poses to start from; `rough` is the one that `neighbor4` turns.
     pub fn starts(&self, starts: &Starts, model: &Model, rough: Option<&DMat4>) -> Result<Vec<DMat4>> {
         match starts {
@@ -149,6 +185,8 @@ pub struct Found {
     /// The part of the picture that the render leaves unexplained: the sum of absolute differences to the render, over that to
     /// an empty (white) picture. 0: equal; 1: no better than nothing.
     pub unexplained: f64,
+    /// Whether that is little enough for a pose that was found.
+    pub converged: bool,
     /// Seconds of the search, a picture's share of its batch.
     pub seconds: f64,
 }
@@ -176,46 +214,11 @@ impl std::fmt::Display for PoseError {
     }
 }
 
-impl Found {
-    /// Whether the estimate explains the picture; says nothing certain about objects that look alike from two sides.
-    pub fn converged(&self) -> bool {
-        self.world_from_camera.is_finite() && self.unexplained < CONVERGED_BELOW
-    }
-}
-
-/// Estimates the poses of `pictures`, all of `side` pixels, each from its own starts.
-pub fn search(
-    engine: &Engine,
-    model: &Model,
-    side: u32,
-    pictures: &[Picture],
-    starts: &[Vec<DMat4>],
-    options: &Options,
-    observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
-) -> Result<Vec<Found>> {
-    let query = |(picture, starts): (&Picture, &Vec<DMat4>)| Query {
-        instance: picture.instance,
-        rgb: picture.rgb.clone(),
-        width: side,
-        height: side,
-        intrinsics: picture.intrinsics,
-        starts: starts.clone(),
-    };
-    let queries: Vec<_> = pictures.iter().zip(starts).map(query).collect();
-    let began = Instant::now();
-    let estimates = estimate(engine, model, &queries, options, observe)?;
-    let seconds = began.elapsed().as_secs_f64() / pictures.len().max(1) as f64;
-
-    let views: Vec<View> =
-        pictures.iter().zip(&estimates).map(|(p, found)| (p.instance, found.pose.to_matrix(), p.intrinsics)).collect();
-    let renders = render(engine, model, side, &views)?;
-    let found = estimates.into_iter().zip(renders).zip(pictures).map(|((estimate, render), picture)| {
-        let sum = |of: &dyn Fn(usize) -> f32| (0..picture.rgb.len()).map(|i| f64::from(of(i).abs())).sum::<f64>();
-        let left = sum(&|i| picture.rgb[i] - render.rgb[i].clamp(-1.0, 1.0));
-        let unexplained = left / sum(&|i| picture.rgb[i] - 1.0);
-        Found { world_from_camera: estimate.pose.to_matrix(), estimate, rgb: render.rgb, unexplained, seconds }
-    });
-    Ok(found.collect())
+/// Sum of absolute differences to `render`, over that to a white picture; not a number if the render has one.
+fn unexplained(picture: &[f32], render: &[f32]) -> f64 {
+    let sum = |differences: &mut dyn Iterator<Item = f32>| differences.map(|d| f64::from(d.abs())).sum::<f64>();
+    let left = sum(&mut picture.iter().zip(render).map(|(p, r)| p - r.clamp(-1.0, 1.0)));
+    left / sum(&mut picture.iter().map(|p| p - 1.0))
 }
 
 /// Instance, `world_from_camera` and intrinsics of a view.
@@ -237,4 +240,18 @@ pub fn render(engine: &Engine, model: &Model, side: u32, views: &[View]) -> Resu
         renders.extend(each.map(|(rgb, depth)| Rendering { rgb: rgb.to_vec(), depth: depth.to_vec() }));
     }
     Ok(renders)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unexplained_is_relative_to_an_empty_picture() {
+        let picture = [0.5, 1.0, -0.5];
+        assert_eq!(unexplained(&picture, &picture), 0.0);
+        assert_eq!(unexplained(&picture, &[1.0, 1.7, 1.0]), 1.0);
+        assert_eq!(unexplained(&picture, &[0.5, 1.0, -1.5]), 0.25);
+        assert!(unexplained(&picture, &[0.5, f32::NAN, -0.5]).is_nan() && unexplained(&[1.0; 3], &[1.0; 3]).is_nan());
+    }
 }
