@@ -144,6 +144,11 @@ impl<T: Real> Executor for CpuExecutor<T> {
         Ok(self.buffers[buffer.index()].f().iter().map(|value| value.as_f32()).collect())
     }
 
+    fn read_f64(&mut self, buffer: BufferId) -> Result<Vec<f64>, ExecutorError> {
+        self.check(buffer, Element::F32, self.plan.buffer(buffer).len)?;
+        Ok(self.buffers[buffer.index()].f().iter().map(|value| value.wide()).collect())
+    }
+
     fn read_u32(&mut self, buffer: BufferId) -> Result<Vec<u32>, ExecutorError> {
         self.check(buffer, Element::U32, self.plan.buffer(buffer).len)?;
         Ok(self.buffers[buffer.index()].u().to_vec())

@@ -25,6 +25,11 @@ pub trait Executor: Send {
     /// Reads a whole `f32` buffer; waits for the work before it and surfaces its errors.
     fn read(&mut self, buffer: BufferId) -> Result<Vec<f32>, ExecutorError>;
 
+    /// Reads a whole `f32` buffer as `f64`; an executor that computes in `f64` gives all its digits.
+    fn read_f64(&mut self, buffer: BufferId) -> Result<Vec<f64>, ExecutorError> {
+        Ok(self.read(buffer)?.into_iter().map(f64::from).collect())
+    }
+
     /// Reads a whole `u32` buffer.
     fn read_u32(&mut self, buffer: BufferId) -> Result<Vec<u32>, ExecutorError>;
 

@@ -1,0 +1,81 @@
+//! The GPU executor against the `f64` reference, step by step through the plans of the whole model.
+
+use std::collections::BTreeMap;
+
+use sigma_srn::{Engine, Train};
+use srn_plan::{Executor, Kernel, StageId};
+use srn_tests::{gpu, lockstep};
+
+use crate::{LOSSES, RAYS, batch, descent, model, trainer};
+
+/// Largest difference of one step on equal inputs, relative to the largest value of its output.
+fn tolerance(kernel: &Kernel) -> Option<f64> {
+    Some(match kernel.name {
+        // Parts that cancel: worst on llvmpipe 3.2e-5.
+        "sum/forward" => 2e-4,
+        // Worst on llvmpipe: 4.6e-6 (`linear/forward`).
+        _ => 2e-5,
+    })
+}
+
+/// Executors that compare alike need plans that are alike: tiles of a part of an image, on both.
+fn engines() -> [Engine; 2] {
+    [Engine::gpu(gpu().clone()), Engine::cpu_f64()].map(|engine| engine.with_tile_rows(RAYS - 20))
+}
+
+fn stage(executor: &dyn Executor, name: &str) -> StageId {
+    let plan = executor.plan();
+    plan.stage_id(plan.stages.iter().position(|stage| stage.name == name).unwrap())
+}
+
+fn step_by_step(subject: &mut dyn Executor, reference: &mut dyn Executor, name: &str) -> BTreeMap<&'static str, f64> {
+    let stage = stage(reference, name);
+    let worst = lockstep(subject, reference, stage, tolerance).unwrap_or_else(|divergence| panic!("{name}: {divergence}"));
+    let largest = worst.iter().max_by(|a, b| a.1.total_cmp(b.1)).unwrap();
+    println!("worst {:.1e}: {} of {} kernels in stage {name}", largest.1, largest.0, worst.len());
+    worst
+}
+
+#[test]
+fn a_training_step() {
+    const IMAGES: u32 = 3;
+    for density in [true, false] {
+        let [mut subject, mut reference] = engines().map(|engine| {
+            let mut trainer = trainer(&engine, model(density), Train::Everything, IMAGES);
+            trainer.step(&batch(IMAGES), 1e-3).unwrap();
+            trainer
+        });
+        let (subject, reference) = (subject.executor(), reference.executor());
+        share_inputs(subject, reference);
+        step_by_step(subject, reference, "gradients");
+        step_by_step(subject, reference, "update");
+    }
+}
+
+#[test]
+fn a_step_of_descent_in_every_loss() {
+    for loss in LOSSES {
+        let [mut subject, mut reference] = engines().map(|engine| {
+            let mut descent = descent(&engine, loss, 3);
+            descent.evaluate().unwrap();
+            descent.descend(0.01).unwrap();
+            descent
+        });
+        let (subject, reference) = (subject.executor(), reference.executor());
+        share_inputs(subject, reference);
+        for name in ["instances", "targets", "evaluate", "descend"] {
+            step_by_step(subject, reference, name);
+        }
+    }
+}
+
+/// After the same calls the inputs are the same up to rounding: now to the last digit.
+fn share_inputs(subject: &mut dyn Executor, reference: &mut dyn Executor) {
+    let plan = subject.plan().clone();
+    for buffer in plan.buffers.iter().filter(|buffer| buffer.role == srn_plan::Role::Input) {
+        let id = plan.find(&buffer.name).unwrap();
+        if buffer.element == srn_plan::Element::F32 {
+            reference.write(id, &subject.read(id).unwrap()).unwrap();
+        }
+    }
+}
