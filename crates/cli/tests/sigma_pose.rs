@@ -177,6 +177,23 @@ fn a_photo_needs_to_be_explained() {
     fail(dir, &format!("{args} --intrinsics intrinsics.txt --instance 2"), &["photo.png", "90×50", "64×64"]);
 }
 
+/// Colours so large that no loss is finite: no pose, no panic, also not in the pictures.
+#[test]
+fn a_search_that_blows_up_has_not_converged() {
+    let home = home();
+    let dir = home.path();
+    let mut model = Model::load(&dir.join("model.safetensors")).unwrap();
+    model.parameters.last_mut().unwrap().values.fill(3e38);
+    model.save(&dir.join("large.safetensors")).unwrap();
+    let args = format!("estimate DATA/{CHICKEN} --model large.safetensors --steps 4 --truth auto --executor cpu --accept 1e9");
+    let report: Value = serde_json::from_str(&run(dir, &format!("{args} --json --record pictures"), 1)).unwrap();
+    let image = &report["images"][0];
+    assert!(image["loss"].is_null() && image["converged"] == false, "{image}");
+    assert_eq!(files(&dir.join("pictures")).len(), 2);
+    assert!(run(dir, &args, 1).contains("NOT CONVERGED"));
+    run(dir, "evaluate --model large.safetensors --data DATA --instances 1 --views 1 --steps 2 --executor cpu --out results", 0);
+}
+
 #[test]
 fn bad_calls_end_with_2_and_one_line() {
     let home = home();

@@ -121,7 +121,7 @@ impl Options {
 pub struct Ranked {
     /// Number of the start in [`Query::starts`].
     pub start: usize,
-    /// Its loss when it was dropped, or at the end.
+    /// Its loss when it was dropped, or at the end; infinite where it was not a number.
     pub loss: f64,
     /// Phases that it went through.
     pub phases: usize,
@@ -177,7 +177,7 @@ pub fn estimate(
     let mut step = 0;
     let mut hypotheses: Vec<Hypothesis> = Vec::new();
     for (query, q) in queries.iter().enumerate() {
-        let new = |(start, matrix)| Hypothesis { query, start, pose: Pose6::from_matrix(matrix), loss: f64::MAX, phases: 0 };
+        let new = |(start, matrix)| Hypothesis { query, start, pose: Pose6::from_matrix(matrix), loss: f64::INFINITY, phases: 0 };
         hypotheses.extend(q.starts.iter().enumerate().map(new));
     }
 
@@ -211,8 +211,9 @@ pub fn estimate(
         for ((hypothesis, last), best) in running.iter_mut().zip(last).zip(best) {
             let take_best = options.keep_best && (best.0 <= last.0 || !last.0.is_finite());
             (hypothesis.loss, hypothesis.pose) = if take_best { best } else { last };
-            if !hypothesis.loss.is_finite() {
-                hypothesis.loss = f64::MAX;
+            // A NaN must not win; the largest f32 is what `best` holds where every loss was one.
+            if hypothesis.loss.is_nan() || hypothesis.loss >= f32::MAX.into() {
+                hypothesis.loss = f64::INFINITY;
             }
             hypothesis.phases = number + 1;
         }

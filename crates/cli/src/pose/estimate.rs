@@ -37,8 +37,6 @@ pub struct Estimate {
     /// True pose, to report errors; like --rough. It has no influence on the search.
     #[arg(long, value_name = "POSE")]
     truth: Vec<PoseSource>,
-    #[command(flatten)]
-    search: SearchArgs,
     /// Print everything as JSON.
     #[arg(long)]
     json: bool,
@@ -50,6 +48,9 @@ pub struct Estimate {
     force: bool,
     #[command(flatten)]
     engine: EngineArgs,
+    // Last, for its heading holds for all flags that follow.
+    #[command(flatten)]
+    search: SearchArgs,
 }
 
 /// What `--json` prints.

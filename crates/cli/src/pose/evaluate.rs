@@ -37,8 +37,6 @@ pub struct Evaluate {
     /// Instances, the first by name.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
     instances: u32,
-    #[command(flatten)]
-    search: SearchArgs,
     /// Print everything as JSON.
     #[arg(long)]
     json: bool,
@@ -50,6 +48,9 @@ pub struct Evaluate {
     force: bool,
     #[command(flatten)]
     engine: EngineArgs,
+    // Last, for its heading holds for all flags that follow.
+    #[command(flatten)]
+    search: SearchArgs,
 }
 
 /// What `--json` prints and `results.json` holds.

@@ -151,7 +151,7 @@ impl SearchArgs {
         let renders = render(engine, model, side, &views)?;
         let found = estimates.into_iter().zip(renders).zip(pictures).map(|((estimate, render), picture)| {
             let unexplained = unexplained(&picture.rgb, &render.rgb);
-            let converged = unexplained <= self.accept;
+            let converged = estimate.loss.is_finite() && unexplained <= self.accept;
             Found { world_from_camera: estimate.pose.to_matrix(), estimate, rgb: render.rgb, unexplained, converged, seconds }
         });
         Ok(found.collect())
@@ -185,7 +185,7 @@ pub struct Found {
     /// The part of the picture that the render leaves unexplained: the sum of absolute differences to the render, over that to
     /// an empty (white) picture. 0: equal; 1: no better than nothing.
     pub unexplained: f64,
-    /// Whether that is little enough for a pose that was found.
+    /// Whether the loss is finite, and that little enough.
     pub converged: bool,
     /// Seconds of the search, a picture's share of its batch.
     pub seconds: f64,
