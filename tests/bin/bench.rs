@@ -1,0 +1,323 @@
+//! `bench [--quick] [--json] [--write]`: what a pose step, a training step and a picture cost on every executor, beside the rate
+//! that the matrix library reaches in the same run. `--write` puts the tables into `docs/performance.md`.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::{Instant, SystemTime};
+
+use sigma_srn::{
+    Descent, Engine, Gpu, Intrinsics, Loss, Model, ModelConfig, Pose6, Rays, Renderer, Shape, Train, Trainer, TrainingBatch,
+    camera, pixel_grid, stream,
+};
+use srn_tests::between;
+
+const USAGE: &str = "usage: bench [--quick] [--json] [--write]";
+const SIDE: u32 = 64;
+const RAYS: u32 = SIDE * SIDE;
+/// Hypotheses of a pose step, as in the paper's measurement.
+const BATCH: u32 = 5;
+
+/// One line of the table.
+#[derive(Clone, Debug)]
+struct Row {
+    what: &'static str,
+    width: u32,
+    executor: &'static str,
+    seconds: f64,
+    /// Floating-point operations, matrix products only.
+    flops: u64,
+    /// Part of the matrix library's rate that was measured beside it.
+    of_sgemm: f64,
+    bytes: u64,
+    budget: u64,
+}
+
+/// Time of one kernel in one run of a stage.
+struct KernelRow {
+    executor: &'static str,
+    label: String,
+    steps: usize,
+    seconds: f64,
+    flops: u64,
+}
+
+type Result<T> = std::result::Result<T, Box<dyn std::error::Error>>;
+
+fn main() -> ExitCode {
+    match run() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn run() -> Result<()> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    if let Some(other) = arguments.iter().find(|argument| !["--quick", "--json", "--write"].contains(&argument.as_str())) {
+        return Err(format!("{USAGE}, not {other}").into());
+    }
+    let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
+    let (quick, json) = (has("--quick"), has("--json"));
+    let runs = if quick { 1 } else { 5 };
+
+    let mut engines = vec![Engine::cpu()];
+    match Gpu::open(None) {
+        Ok(gpu) => engines.push(Engine::gpu(gpu)),
+        Err(error) => eprintln!("only the CPU executor: {error}"),
+    }
+    let hardware = hardware(&engines);
+    eprintln!("{hardware}");
+    let (mut rows, mut kernels, mut ceilings) = (Vec::new(), Vec::new(), Vec::new());
+    // The small nets first: the kernels of the large ones are compiled then.
+    for width in if quick { vec![64] } else { vec![64, 256] } {
+        let model = model(width)?;
+        for engine in &engines {
+            let mut bench = Bench { engine, model: &model, runs, ceilings: &mut ceilings };
+            let (row, profile) = bench.pose_step()?;
+            rows.push(row);
+            kernels.extend(profile.into_iter().filter(|_| width == 64));
+            if width == 64 || engine.as_gpu().is_none() {
+                rows.push(bench.training_step()?);
+            }
+            rows.push(bench.picture()?);
+            rows.iter().rev().take(3).rev().filter(|row| row.width == width).for_each(|row| eprintln!("{}", line(row)));
+        }
+    }
+    let ceiling = median(&mut ceilings);
+    if json {
+        println!("{:#}", as_json(&hardware, ceiling, &rows, &kernels));
+    } else {
+        println!("{}", report(&hardware, ceiling, &rows, &kernels));
+    }
+    if has("--write") {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/performance.md");
+        let text = report(&hardware, ceiling, &rows, &kernels);
+        let new = between::replace(&std::fs::read_to_string(&path)?, "bench", &text)?;
+        std::fs::write(&path, new)?;
+    }
+    Ok(())
+}
+
+/// The paper's nets, or the compact ones.
+fn model(width: u32) -> Result<Model> {
+    let latent = if width == 256 { 256 } else { 32 };
+    let config = ModelConfig { hidden: width, latent, instances: 9, tracing_steps: 10, density: true };
+    Ok(Model::init(&config, 1)?)
+}
+
+fn name(engine: &Engine) -> &'static str {
+    if engine.as_gpu().is_some() { "gpu" } else { "cpu" }
+}
+
+fn intrinsics() -> Intrinsics {
+    Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.0 }
+}
+
+fn rays(images: u32, pixels: u32) -> Rays {
+    let mut random = stream(0, 0);
+    let mut rays = Rays::default();
+    for camera in camera::fixed24(1.3).iter().take(images as usize) {
+        rays.push(camera, &intrinsics(), pixel_grid(SIDE, SIDE, 1).take(pixels as usize), &mut random);
+    }
+    rays
+}
+
+fn target(values: u32) -> Vec<f32> {
+    (0..values).map(|k| (k * 7919 % 200) as f32 / 100.0 - 1.0).collect()
+}
+
+struct Bench<'a> {
+    engine: &'a Engine,
+    model: &'a Model,
+    runs: usize,
+    ceilings: &'a mut Vec<f64>,
+}
+
+impl Bench<'_> {
+    /// Median seconds of several runs, with the rate of the matrix library measured before each.
+    fn measure(&mut self, mut work: impl FnMut() -> Result<()>) -> Result<(f64, f64)> {
+        work()?;
+        let (mut seconds, mut rates) = (Vec::new(), Vec::new());
+        for _ in 0..self.runs {
+            rates.push(sgemm_rate());
+            let begin = Instant::now();
+            work()?;
+            seconds.push(begin.elapsed().as_secs_f64());
+        }
+        self.ceilings.extend(&rates);
+        Ok((median(&mut seconds), median(&mut rates)))
+    }
+
+    fn row(&self, what: &'static str, (seconds, ceiling): (f64, f64), flops: u64, bytes: u64) -> Row {
+        let (width, executor, budget) = (self.model.layout.features(), name(self.engine), self.engine.budget());
+        Row { what, width, executor, seconds, flops, of_sgemm: flops as f64 / seconds / ceiling, bytes, budget }
+    }
+
+    fn pose_step(&mut self) -> Result<(Row, Vec<KernelRow>)> {
+        let shape = Shape { hypotheses: BATCH, width: SIDE, height: SIDE, instances: 1 };
+        let mut descent = Descent::new(self.engine, self.model, shape, Loss::Mae)?;
+        descent.set_targets(&[0], &[0; BATCH as usize], &rays(BATCH, RAYS), &target(3 * BATCH * RAYS))?;
+        let poses: Vec<Pose6> = camera::fixed24(1.3).iter().take(BATCH as usize).map(Pose6::from_matrix).collect();
+        descent.set_poses(&poses)?;
+        let time = self.measure(|| {
+            descent.evaluate()?;
+            descent.descend(0.01)?;
+            descent.losses()?;
+            Ok(())
+        })?;
+        let row = self.row("pose step, 5 hypotheses", time, descent.flops_per_step(), descent.bytes());
+        Ok((row, profile(&mut descent, name(self.engine))?))
+    }
+
+    fn training_step(&mut self) -> Result<Row> {
+        const IMAGES: u32 = 10;
+        const PIXELS: u32 = 512;
+        let mut trainer = Trainer::new(self.engine, self.model.clone(), Train::Everything, IMAGES, PIXELS)?;
+        let instances = (0..IMAGES).map(|image| image % 9).collect();
+        let batch = TrainingBatch { instances, rays: rays(IMAGES, PIXELS), target_rgb: target(3 * IMAGES * PIXELS) };
+        let time = self.measure(|| {
+            trainer.step(&batch, 1e-4)?;
+            trainer.losses()?;
+            Ok(())
+        })?;
+        let plan = trainer.executor().plan();
+        let flops = plan.stages.iter().flat_map(|stage| &stage.steps).map(|step| step.flops).sum();
+        let bytes = plan.bytes();
+        Ok(self.row("training step, 10 × 512 rays", time, flops, bytes))
+    }
+
+    fn picture(&mut self) -> Result<Row> {
+        let mut renderer = Renderer::new(self.engine, self.model, 1, SIDE, SIDE)?;
+        let cameras = [(camera::fixed24(1.3)[3], intrinsics())];
+        let time = self.measure(|| {
+            renderer.render(&[0], &cameras, 0)?;
+            Ok(())
+        })?;
+        // A fifth of a pose step is one picture forward and backward; only its time is reported.
+        Ok(self.row("picture", time, 0, 0))
+    }
+}
+
+/// Time of each kernel: from the device's clock on a GPU, from ours on the CPU.
+fn profile(descent: &mut Descent, executor_name: &'static str) -> Result<Vec<KernelRow>> {
+    let row = |(label, (steps, seconds, flops))| KernelRow { executor: executor_name, label, steps, seconds, flops };
+    if let Some(times) = descent.profile()? {
+        return Ok(times.into_iter().map(|time| row((time.label, (time.steps, time.seconds, time.flops)))).collect());
+    }
+    let executor = descent.executor();
+    let plan = executor.plan().clone();
+    let evaluate = plan.stages.iter().position(|stage| stage.name == "evaluate").expect("a descent evaluates");
+    let mut times: BTreeMap<String, (usize, f64, u64)> = BTreeMap::new();
+    for (index, step) in plan.stages[evaluate].steps.iter().enumerate() {
+        let begin = Instant::now();
+        executor.run_step(plan.stage_id(evaluate), index)?;
+        let (steps, seconds, flops) = times.entry(step.kernel.name.into()).or_default();
+        *steps += 1;
+        *seconds += begin.elapsed().as_secs_f64();
+        *flops += step.flops;
+    }
+    let mut rows: Vec<KernelRow> = times.into_iter().map(row).collect();
+    rows.sort_by(|a, b| b.seconds.total_cmp(&a.seconds));
+    Ok(rows)
+}
+
+/// Floating-point operations a second of the matrix library, with all threads, on a product that fits no cache; best of two.
+fn sgemm_rate() -> f64 {
+    const N: usize = 1536;
+    let (a, b, mut c) = (vec![0.5f32; N * N], vec![0.25f32; N * N], vec![0f32; N * N]);
+    let mut best = f64::INFINITY;
+    for _ in 0..2 {
+        let begin = Instant::now();
+        let n = N as isize;
+        // SAFETY: the three matrices have N × N values.
+        unsafe {
+            let (a, b, threads) = (a.as_ptr(), b.as_ptr(), gemm::Parallelism::Rayon(0));
+            gemm::gemm(N, N, N, c.as_mut_ptr(), 1, n, false, a, 1, n, b, 1, n, 0.0, 1.0, false, false, false, threads);
+        }
+        best = best.min(begin.elapsed().as_secs_f64());
+    }
+    assert_eq!(c[N + 1], 0.125 * N as f32);
+    2.0 * (N as f64).powi(3) / best
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+}
+
+/// Processor, threads, adapter and date.
+fn hardware(engines: &[Engine]) -> String {
+    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let cpu = info.lines().find(|line| line.starts_with("model name")).and_then(|line| line.split(": ").nth(1));
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let adapter = engines.iter().find_map(Engine::as_gpu).map_or("no adapter".into(), |gpu| gpu.adapter().to_string());
+    format!("{}, {threads} threads; {adapter}; {}", cpu.unwrap_or(std::env::consts::ARCH).trim(), date())
+}
+
+/// Today in UTC: days since 1970-01-01 to year, month, day (Hinnant's civil_from_days).
+fn date() -> String {
+    let days = SystemTime::UNIX_EPOCH.elapsed().map_or(0, |time| time.as_secs() / 86_400) + 719_468;
+    let (era, day_of_era) = (days / 146_097, days % 146_097);
+    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let shifted = (5 * day_of_year + 2) / 153;
+    let (day, month) = (day_of_year - (153 * shifted + 2) / 5 + 1, if shifted < 10 { shifted + 3 } else { shifted - 9 });
+    format!("{}-{month:02}-{day:02}", era * 400 + year_of_era + u64::from(month <= 2))
+}
+
+fn line(row: &Row) -> String {
+    let seconds = if row.seconds < 0.1 { format!("{:.1} ms", 1e3 * row.seconds) } else { format!("{:.2} s", row.seconds) };
+    let mut cells = vec![row.what.into(), row.width.to_string(), row.executor.into(), seconds];
+    if row.flops == 0 {
+        cells.extend(["", "", "", ""].map(String::from));
+    } else {
+        cells.push(format!("{:.1}", row.flops as f64 / 1e9));
+        cells.push(format!("{:.1}", row.flops as f64 / row.seconds / 1e9));
+        cells.push(format!("{:.0} %", 100.0 * row.of_sgemm));
+        cells.push(format!("{} of {} MiB", row.bytes >> 20, row.budget >> 20));
+    }
+    format!("| {} |", cells.join(" | "))
+}
+
+fn report(hardware: &str, ceiling: f64, rows: &[Row], kernels: &[KernelRow]) -> String {
+    let mut text = format!("{hardware}. `cargo xtask bench`\n\n");
+    text +=
+        &format!("Matrix library (`gemm`, 1536 × 1536 × 1536, all threads) in the same run: {:.0} GFLOP/s.\n\n", ceiling / 1e9);
+    text += "| work, 64 × 64 pixels | width | executor | median time | GFLOP | GFLOP/s | of sgemm | plan of budget |\n";
+    text += "|---|---|---|---|---|---|---|---|\n";
+    rows.iter().for_each(|row| text += &format!("{}\n", line(row)));
+    text += "\nKernels of a pose step at width 64, each timed alone:\n\n| executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|\n";
+    for executor in ["cpu", "gpu"] {
+        for kernel in kernels.iter().filter(|kernel| kernel.executor == executor).take(8) {
+            let KernelRow { label, steps, seconds, flops, .. } = kernel;
+            let rate = if *flops == 0 { String::new() } else { format!("{:.1}", *flops as f64 / seconds / 1e9) };
+            text += &format!("| {executor} | `{label}` | {steps} | {:.1} | {rate} |\n", 1e3 * seconds);
+        }
+    }
+    text
+}
+
+fn as_json(hardware: &str, ceiling: f64, rows: &[Row], kernels: &[KernelRow]) -> serde_json::Value {
+    let rows: Vec<_> = rows
+        .iter()
+        .map(|row| {
+            serde_json::json!({
+                "work": row.what, "width": row.width, "executor": row.executor, "seconds": row.seconds, "flops": row.flops,
+                "of_sgemm": row.of_sgemm, "bytes": row.bytes, "budget": row.budget,
+            })
+        })
+        .collect();
+    let kernels: Vec<_> = kernels
+        .iter()
+        .map(|kernel| {
+            serde_json::json!({
+                "executor": kernel.executor, "kernel": kernel.label, "steps": kernel.steps, "seconds": kernel.seconds,
+                "flops": kernel.flops,
+            })
+        })
+        .collect();
+    serde_json::json!({ "hardware": hardware, "sgemm_flops_per_second": ceiling, "rows": rows, "kernels": kernels })
+}
