@@ -1,4 +1,8 @@
 //! `sigma-train fit`: a run, its folder, and how it goes on after a stop.
+//!
+//! A run's folder: `config.json` (all settings), `metrics.jsonl`, `samples/step_NNNNNN.png` (target, rendering, depth),
+//! `checkpoint.safetensors` (model and moments), in the end `model.safetensors` and `curves.png`. Metrics are written before the
+//! checkpoint; on resuming, lines behind the checkpoint's step are dropped, and those steps are done again.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
@@ -92,6 +96,9 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     fs::create_dir_all(&samples).map_err(|error| format!("{}: {error}", samples.display()))?;
     let mut metrics = Metrics::open(run.join("metrics.jsonl"), trainer.steps())?;
 
+    if is_resumed {
+        eprintln!("going on after step {}", trainer.steps());
+    }
     let stop = stop_on_signal()?;
     let mut meter = Meter::new(&settings, trainer.steps(), metrics.last().map_or(0.0, |record| record.seconds));
     let mut checkpointed = Instant::now();
