@@ -56,7 +56,7 @@ macro_rules! params {
 }
 
 params! {
-    /// `pose/*`: number of poses.
+    /// `pose/*`, `compose/*`: number of poses.
     PoseParams {
         /// Number of poses.
         poses: u32,

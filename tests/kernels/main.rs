@@ -10,6 +10,7 @@ use srn_tests::{Case, Divergence, gpu, lockstep};
 
 mod adam;
 mod advance;
+mod compose;
 mod density_sum;
 mod depth;
 mod depth_loss;
@@ -47,6 +48,8 @@ type Fault = (&'static str, &'static str, &'static str);
 static ALL: &[&KernelTest] = &[
     &pose::FORWARD,
     &pose::BACKWARD,
+    &compose::FORWARD,
+    &compose::BACKWARD,
     &rays::FORWARD,
     &rays::BACKWARD,
     &tile::GATHER,

@@ -1,9 +1,10 @@
 //! One step of pose estimation for many hypotheses at once (spec 4): render, loss, gradient to the six numbers, Adam.
 
-use srn_plan::ops::{adam, gmsd, image_loss, keep_best, pose, rays, tile as tile_ops};
+use glam::DMat4;
+use srn_plan::ops::{adam, compose, gmsd, image_loss, keep_best, pose, rays, tile as tile_ops};
 use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, tiles};
 
-use crate::camera::Pose6;
+use crate::camera::{Pose6, to_rows};
 use crate::engine::{Engine, Runner};
 use crate::model::Model;
 use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, Started, Trainable, backward, forward};
@@ -54,6 +55,7 @@ pub struct Shape {
 struct Handles {
     network: Network,
     target: BufferId,
+    start: BufferId,
     pose6: BufferId,
     d_pose6: BufferId,
     loss: BufferId,
@@ -72,6 +74,8 @@ pub struct Descent {
     runner: Runner,
     handles: Handles,
     shape: Shape,
+    /// What the motions are applied to; see [`Descent::set_starts`].
+    starts: Vec<DMat4>,
     steps: u64,
 }
 
@@ -92,7 +96,7 @@ impl Descent {
             engine.fit(rows, model.layout.features(), |b, tile_rows| build(b, model, shape, loss, tile_rows))?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, model)?;
-        Ok(Descent { runner, handles, shape, steps: 0 })
+        Ok(Descent { runner, handles, shape, starts: Vec::new(), steps: 0 })
     }
 
     /// Bytes of all buffers.
@@ -142,12 +146,25 @@ impl Descent {
         Ok(())
     }
 
-    /// Sets the poses and forgets momentum and best steps.
+    /// Sets the poses; the steps change their six numbers themselves, as in the paper. Forgets momentum and best steps.
     pub fn set_poses(&mut self, poses: &[Pose6]) -> Result<(), Error> {
-        let values: Vec<f64> = poses.iter().flat_map(|pose| pose.0).collect();
+        self.set(poses, vec![DMat4::IDENTITY; poses.len()])
+    }
+
+    /// Sets the poses; the steps change the six numbers of a motion about the object (the world origin) that is applied to
+    /// them, zero at first: the camera orbits when the angles change, and no start is at the Euler angles' singularity.
+    pub fn set_starts(&mut self, starts: &[Pose6]) -> Result<(), Error> {
+        self.set(&vec![Pose6([0.0; 6]); starts.len()], starts.iter().map(|start| start.to_matrix()).collect())
+    }
+
+    fn set(&mut self, motions: &[Pose6], starts: Vec<DMat4>) -> Result<(), Error> {
+        let rows: Vec<f64> = starts.iter().flat_map(to_rows).collect();
+        self.runner.write_f64(self.handles.start, &rows)?;
+        self.starts = starts;
+        let values: Vec<f64> = motions.iter().flat_map(|motion| motion.0).collect();
         self.runner.write_f64(self.handles.pose6, &values)?;
         self.runner.write_f64(self.handles.best_pose6, &values)?;
-        self.runner.write(self.handles.best_loss, &vec![f32::MAX; poses.len()])?;
+        self.runner.write(self.handles.best_loss, &vec![f32::MAX; motions.len()])?;
         for moment in self.handles.moments {
             self.runner.write(moment, &vec![0.0; values.len()])?;
         }
@@ -179,19 +196,29 @@ impl Descent {
 
     /// The poses as they are now.
     pub fn poses(&mut self) -> Result<Vec<Pose6>, Error> {
-        Ok(poses(&self.runner.read(self.handles.pose6)?))
+        let motions = six_numbers(&self.runner.read(self.handles.pose6)?);
+        Ok(self.moved(&motions))
     }
 
-    /// Gradients of the last evaluation with respect to the six numbers.
+    /// Where the motions take the starts.
+    fn moved(&self, motions: &[[f64; 6]]) -> Vec<Pose6> {
+        let move_start = |(&motion, start): (&[f64; 6], &DMat4)| {
+            // Camera's own numbers: as they are, also where the same matrix has others.
+            if *start == DMat4::IDENTITY { Pose6(motion) } else { Pose6::from_matrix(&(Pose6(motion).to_matrix() * *start)) }
+        };
+        motions.iter().zip(&self.starts).map(move_start).collect()
+    }
+
+    /// Gradients of the last evaluation with respect to the six numbers that the steps change.
     pub fn gradients(&mut self) -> Result<Vec<[f64; 6]>, Error> {
-        Ok(poses(&self.runner.read(self.handles.d_pose6)?).into_iter().map(|pose| pose.0).collect())
+        Ok(six_numbers(&self.runner.read(self.handles.d_pose6)?))
     }
 
     /// The best pose of each hypothesis that [`Descent::descend`] has seen, with its loss.
     pub fn best(&mut self) -> Result<Vec<(f64, Pose6)>, Error> {
         let losses = self.runner.read(self.handles.best_loss)?;
-        let best = poses(&self.runner.read(self.handles.best_pose6)?);
-        Ok(losses.into_iter().map(f64::from).zip(best).collect())
+        let best = six_numbers(&self.runner.read(self.handles.best_pose6)?);
+        Ok(losses.into_iter().map(f64::from).zip(self.moved(&best)).collect())
     }
 
     /// Colours of the last evaluation `[hypotheses, rays, 3]`.
@@ -205,8 +232,8 @@ impl Descent {
     }
 }
 
-fn poses(values: &[f32]) -> Vec<Pose6> {
-    values.chunks_exact(6).map(|pose| Pose6(std::array::from_fn(|k| pose[k].into()))).collect()
+fn six_numbers(values: &[f32]) -> Vec<[f64; 6]> {
+    values.chunks_exact(6).map(|six| std::array::from_fn(|k| six[k].into())).collect()
 }
 
 fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u32) -> Result<Handles, PlanError> {
@@ -227,6 +254,8 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u3
     let target = b.input("target rgb", values)?;
     let loss_buffer = b.scratch("loss", n)?;
     let pose6 = b.input("pose6", 6 * n)?;
+    let start = b.input("start", 12 * n)?;
+    let (motion, d_motion) = (b.scratch("motion", 12 * n)?, b.scratch("d motion", 12 * n)?);
     let (d_pose6, d_matrix) = (b.scratch("d pose6", 6 * n)?, b.scratch("d world_from_camera", 12 * n)?);
 
     let instances = b.stage("instances");
@@ -255,7 +284,8 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u3
 
     let evaluate = b.stage("evaluate");
     let mut started = Started::default();
-    pose::forward(b, hypotheses, pose6, network.world_from_camera)?;
+    pose::forward(b, hypotheses, pose6, motion)?;
+    compose::forward(b, hypotheses, motion, start, network.world_from_camera)?;
     // A loss of whole images needs all tiles before the first gradient; the tiles are rendered once more on the way back.
     if let Comparison::Gmsd { saved: maps, d_response, d_rgb } = comparison {
         for &tile in &cut {
@@ -288,7 +318,8 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u3
     if let Comparison::PerPixel { kind, count, .. } = comparison {
         image_loss::forward(b, kind, hypotheses, rays_per_image, network.rgb, target, count, partial, loss_buffer)?;
     }
-    pose::backward(b, hypotheses, pose6, d_matrix, d_pose6)?;
+    compose::backward(b, hypotheses, start, d_matrix, d_motion)?;
+    pose::backward(b, hypotheses, pose6, d_motion, d_pose6)?;
 
     let descend = b.stage("descend");
     let schedule = b.input("schedule", 3)?;
@@ -300,6 +331,7 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u3
     Ok(Handles {
         network,
         target,
+        start,
         pose6,
         d_pose6,
         loss: loss_buffer,

@@ -47,17 +47,28 @@ pub struct Options {
     pub loss: Loss,
     /// Phases, one after the other.
     pub phases: Vec<Phase>,
-    /// True: a hypothesis ends at its best step; false: at its last, as in the paper.
+    /// What the steps change.
+    pub frame: Frame,
+    /// True: a hypothesis ends at the best step of its last phase; false: at its last step, as in the paper.
     pub keep_best: bool,
     /// Seed of the initial depths.
     pub seed: u64,
+}
+
+/// What the steps of a descent change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Frame {
+    /// The camera's own six numbers, as in the paper: to orbit the object, angles and centre must change together.
+    Camera,
+    /// The six numbers of a motion about the object: [`Descent::set_starts`].
+    Object,
 }
 
 impl Options {
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
     pub fn paper() -> Self {
         let phase = Phase { steps: 300, stride: 1, learning_rate: (0.1, 0.1), keep: usize::MAX };
-        Options { loss: Loss::Mae, phases: vec![phase], keep_best: false, seed: 0 }
+        Options { loss: Loss::Mae, phases: vec![phase], frame: Frame::Camera, keep_best: false, seed: 0 }
     }
 
     /// All starts on few rays, the most promising ones on more, the best few to the end.
@@ -67,7 +78,7 @@ impl Options {
             Phase { steps: 60, stride: 2, learning_rate: (0.1, 0.05), keep: 6 },
             Phase { steps: 150, stride: 2, learning_rate: (0.05, 0.002), keep: 2 },
         ];
-        Options { loss: Loss::Mae, phases, keep_best: true, seed: 0 }
+        Options { loss: Loss::Mae, phases, frame: Frame::Object, keep_best: true, seed: 0 }
     }
 
     /// The same with `steps` steps in all, shared between the phases in their present proportions.
@@ -209,7 +220,8 @@ pub fn estimate(
         let last: Vec<(f64, Pose6)> = descent.losses()?.into_iter().zip(descent.poses()?).collect();
         let best = descent.best()?;
         for ((hypothesis, last), best) in running.iter_mut().zip(last).zip(best) {
-            let take_best = options.keep_best && (best.0 <= last.0 || !last.0.is_finite());
+            let is_last = number + 1 == options.phases.len();
+            let take_best = options.keep_best && is_last && (best.0 <= last.0 || !last.0.is_finite());
             (hypothesis.loss, hypothesis.pose) = if take_best { best } else { last };
             // A NaN must not win; the largest f32 is what `best` holds where every loss was one.
             if hypothesis.loss.is_nan() || hypothesis.loss >= f32::MAX.into() {
@@ -274,7 +286,11 @@ fn prepare(
     };
     let mut descent = Descent::new(engine, model, shape, options.loss)?;
     descent.set_targets(&instances, &slots, &rays, &target)?;
-    descent.set_poses(&running.iter().map(|h| h.pose).collect::<Vec<_>>())?;
+    let poses: Vec<Pose6> = running.iter().map(|h| h.pose).collect();
+    match options.frame {
+        Frame::Camera => descent.set_poses(&poses)?,
+        Frame::Object => descent.set_starts(&poses)?,
+    }
     Ok(descent)
 }
 

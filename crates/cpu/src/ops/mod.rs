@@ -2,6 +2,7 @@
 
 pub mod adam;
 pub mod advance;
+pub mod compose;
 pub mod density_sum;
 pub mod depth;
 pub mod depth_loss;
