@@ -71,12 +71,12 @@ impl Options {
         Options { loss: Loss::Mae, phases: vec![phase], frame: Frame::Camera, keep_best: false, seed: 0 }
     }
 
-    /// All starts on few rays, the most promising ones on more, the best few to the end.
+    /// Steps about the object; all starts on few rays, the six most promising ones on more, the best two to the end.
     pub fn culled() -> Self {
         let phases = vec![
-            Phase { steps: 40, stride: 4, learning_rate: (0.1, 0.1), keep: usize::MAX },
-            Phase { steps: 60, stride: 2, learning_rate: (0.1, 0.05), keep: 6 },
-            Phase { steps: 150, stride: 2, learning_rate: (0.05, 0.002), keep: 2 },
+            Phase { steps: 30, stride: 4, learning_rate: (0.05, 0.05), keep: usize::MAX },
+            Phase { steps: 50, stride: 3, learning_rate: (0.05, 0.03), keep: 6 },
+            Phase { steps: 60, stride: 2, learning_rate: (0.03, 0.002), keep: 2 },
         ];
         Options { loss: Loss::Mae, phases, frame: Frame::Object, keep_best: true, seed: 0 }
     }
