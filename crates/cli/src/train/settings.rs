@@ -94,10 +94,10 @@ pub struct ForGood {
     /// Use only the first views of each instance, this many [compact all, paper 50].
     #[arg(long, value_name = "N", value_parser = up_to(u32::MAX))]
     views: Option<u32>,
-    /// Images per step [10].
+    /// Images per step [compact 20, paper 10].
     #[arg(long, value_name = "N", value_parser = up_to(100000))]
     batch: Option<u32>,
-    /// Random rays per image; side² takes whole images [compact 512, paper side²].
+    /// Random rays per image; side² takes whole images [compact 256, paper side²].
     #[arg(long, value_name = "N", value_parser = up_to(u32::MAX))]
     rays: Option<u32>,
     /// Decides the first weights and every draw [0].
@@ -126,7 +126,7 @@ pub struct Changeable {
     /// Unseen views of the same instances, for validation. Without it, training views are looked at.
     #[arg(long, value_name = "DIR")]
     validation: Option<PathBuf>,
-    /// Number of steps [compact 12000, paper 100000].
+    /// Number of steps [compact 14000, paper 100000].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     steps: Option<u64>,
     /// Learning rate of Adam [compact 5e-4, paper 5e-5].
@@ -172,9 +172,9 @@ impl Settings {
             density: !for_good.plain_srn,
             side: 64,
             views: is_paper.then_some(50),
-            batch: 10,
+            batch: if is_paper { 10 } else { 20 },
             rays: 0,
-            steps: if is_paper { 100_000 } else { 12_000 },
+            steps: if is_paper { 100_000 } else { 14_000 },
             lr: if is_paper { 5e-5 } else { 5e-4 },
             decay: if is_paper { 1.0 } else { 0.1 },
             decay_from: 0,
@@ -191,7 +191,7 @@ impl Settings {
         settings.views = for_good.views.map(|views| views as usize).or(settings.views);
         settings.checkpoint_every = for_good.checkpoint_every;
         let pixels = settings.side.saturating_mul(settings.side);
-        settings.rays = for_good.rays.unwrap_or(if is_paper { pixels } else { 512.min(pixels) });
+        settings.rays = for_good.rays.unwrap_or(if is_paper { pixels } else { 256.min(pixels) });
         if settings.rays > pixels {
             return Err(format!("--rays {}: an image of side {} has {pixels} pixels", settings.rays, settings.side).into());
         }
