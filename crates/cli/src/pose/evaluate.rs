@@ -56,9 +56,8 @@ pub struct Evaluate {
 /// What `--json` prints and `results.json` holds.
 #[derive(Serialize)]
 struct Report {
-    model: PathBuf,
-    data: PathBuf,
-    starts: String,
+    /// The call, word by word.
+    command: Vec<String>,
     /// `cpu`, or the adapter's name.
     executor: String,
     overall: Summary,
@@ -165,9 +164,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     let views: Vec<ViewReport> = results.into_iter().map(|(report, ..)| report).collect();
     let of = |name: &str| Summary::of(name, &views.iter().filter(|view| view.instance == name).collect::<Vec<_>>());
     let report = Report {
-        model: args.model.clone(),
-        data: args.data.clone(),
-        starts: args.starts.to_string(),
+        command: std::env::args().collect(),
         executor: engine.to_string(),
         overall: Summary::of("all", &views.iter().collect::<Vec<_>>()),
         instances: instances.iter().map(|files| of(&files.name)).collect(),

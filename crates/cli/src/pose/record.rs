@@ -109,85 +109,77 @@ struct Page<'a> {
     chosen: &'a [usize],
 }
 
+/// A view with its heading, and the lines below it.
+struct Panel {
+    heading: String,
+    view: RgbImage,
+    captions: Vec<String>,
+}
+
 impl Page<'_> {
     /// Target, start, two steps, estimate and difference above the curves of all losses. `renders`: of the chosen points.
     fn sheet(&self, renders: &[&[f32]]) -> RgbImage {
-        let target = &self.picture.rgb[..];
         let last = renders.len() - 1;
-        let start = self.found.estimate.ranking[0].start;
-        let mut panels = vec![
-            ("TARGET".to_string(), draw::view(target, self.side, SHOWN), vec!["the given picture".to_string()]),
-            (format!("START {start}"), draw::view(renders[0], self.side, SHOWN), self.captions(0)),
-        ];
-        for part in [1, 2] {
-            let k = last * part / 3;
-            panels.push((
-                format!("STEP {}", self.path[self.chosen[k]].step),
-                draw::view(renders[k], self.side, SHOWN),
-                self.captions(k),
-            ));
-        }
-        panels.push(("ESTIMATE".into(), draw::view(renders[last], self.side, SHOWN), self.captions(last)));
-        let left = format!("{:.0} % unexplained", 100.0 * self.found.unexplained);
-        let difference = draw::difference(target, renders[last], self.side, SHOWN);
-        panels.push(("DIFFERENCE".into(), difference, vec!["white: none, black: large".into(), left]));
-
-        let shown = panels[0].1.width();
-        let width = GAP + panels.len() as u32 * (shown + GAP);
-        let [top, below] = [86, 86 + shown + 6];
-        let mut page = sheet::blank(width, below + 40 + 300);
-        self.headline(&mut page, 2);
-        for (k, (heading, view, captions)) in panels.iter().enumerate() {
-            let x = (GAP + k as u32 * (shown + GAP)) as i32;
-            sheet::title(&mut page, x, top as i32 - 22, heading, 2, BLACK);
-            image::imageops::replace(&mut page, view, x.into(), top.into());
-            for (line, caption) in captions.iter().enumerate() {
-                sheet::text(&mut page, x, below as i32 + 12 * line as i32, caption, BLACK);
-            }
-        }
-        let plot = self.losses([width - 2 * GAP, 300], u32::MAX);
-        image::imageops::replace(&mut page, &plot, GAP.into(), (below + 40).into());
-        page
+        let step = |k: usize| format!("STEP {}", self.path[self.chosen[k]].step);
+        let start = format!("START {}", self.found.estimate.ranking[0].start);
+        let headings = [(start, 0), (step(last / 3), last / 3), (step(last * 2 / 3), last * 2 / 3), ("ESTIMATE".into(), last)];
+        let mut panels = vec![self.target()];
+        panels.extend(headings.map(|(heading, k)| self.step(heading, renders[k], k)));
+        panels.push(self.difference(renders[last]));
+        panels[5].captions.push(format!("{:.0} % unexplained", 100.0 * self.found.unexplained));
+        self.page(&panels, 2, 300, u32::MAX)
     }
 
-    /// Target, render and their difference, over the loss so far.
+    /// Target, render and their difference, over the loss so far; with the seconds that each frame stays.
     fn animation(&self, renders: &[&[f32]]) -> Vec<(RgbImage, f64)> {
-        let last = renders.len() - 1;
-        let frame = |k: usize| {
-            let point = &self.path[self.chosen[k]];
-            let views = [
-                ("TARGET".to_string(), draw::view(&self.picture.rgb, self.side, SHOWN)),
-                (format!("STEP {}", point.step), draw::view(renders[k], self.side, SHOWN)),
-                ("DIFFERENCE".into(), draw::difference(&self.picture.rgb, renders[k], self.side, SHOWN)),
-            ];
-            let shown = views[0].1.width();
-            let width = GAP + 3 * (shown + GAP);
-            let top = 68;
-            let mut page = sheet::blank(width, top + shown + 22 + 140);
-            self.headline(&mut page, 1);
-            for (i, (heading, view)) in views.iter().enumerate() {
-                let x = GAP + i as u32 * (shown + GAP);
-                sheet::title(&mut page, x as i32, top as i32 - 22, heading, 2, BLACK);
-                image::imageops::replace(&mut page, view, x.into(), top.into());
-            }
-            let caption = self.captions(k).join(", ");
-            sheet::text(&mut page, (GAP + shown + GAP) as i32, (top + shown + 6) as i32, &caption, BLACK);
-            let plot = self.losses([width - 2 * GAP, 140], point.step);
-            image::imageops::replace(&mut page, &plot, GAP.into(), (top + shown + 22).into());
-            (page, if k == 0 || k == last { 2.0 } else { 0.1 })
+        let frame = |(k, render): (usize, &&[f32])| {
+            let step = self.path[self.chosen[k]].step;
+            let panels = [self.target(), self.step(format!("STEP {step}"), render, k), self.difference(render)];
+            (self.page(&panels, 1, 140, step), if k == 0 || k + 1 == renders.len() { 2.0 } else { 0.1 })
         };
-        (0..renders.len()).map(frame).collect()
+        renders.iter().enumerate().map(frame).collect()
     }
 
-    fn headline(&self, page: &mut RgbImage, scale: u32) {
+    fn target(&self) -> Panel {
+        let view = draw::view(&self.picture.rgb, self.side, SHOWN);
+        Panel { heading: "TARGET".into(), view, captions: vec!["the picture given".into()] }
+    }
+
+    fn step(&self, heading: String, render: &[f32], k: usize) -> Panel {
+        Panel { heading, view: draw::view(render, self.side, SHOWN), captions: self.captions(k) }
+    }
+
+    fn difference(&self, render: &[f32]) -> Panel {
+        let view = draw::difference(&self.picture.rgb, render, self.side, SHOWN);
+        Panel { heading: "DIFFERENCE".into(), view, captions: vec!["white: none, black: much".into()] }
+    }
+
+    /// Headline, panels, and the losses with the winner's up to `step`.
+    fn page(&self, panels: &[Panel], scale: u32, plot_height: u32, step: u32) -> RgbImage {
+        let shown = panels[0].view.width();
+        let width = GAP + panels.len() as u32 * (shown + GAP);
+        let top = 52 + 16 * scale;
+        let below = top + shown + 6;
+        let mut page = sheet::blank(width, below + 36 + plot_height);
         let verdict = if self.found.converged { "pose found" } else { "not converged" };
-        sheet::title(page, GAP as i32, 12, &format!("{}: {verdict}", self.picture.name), scale, BLACK);
-        let starts = self.found.estimate.ranking.len();
-        let mut line = format!("start {} of {starts}", self.found.estimate.ranking[0].start);
+        sheet::title(&mut page, GAP as i32, 12, &format!("{}: {verdict}", self.picture.name), scale, BLACK);
+        let ranking = &self.found.estimate.ranking;
+        let mut line = format!("start {} of {}", ranking[0].start, ranking.len());
         if let Some(truth) = &self.picture.truth {
             line += &format!(", {}", off(&PoseError::of(&self.found.world_from_camera, truth)));
         }
-        sheet::text(page, GAP as i32, 12 + 8 * scale as i32 + 6, &line, BLACK);
+        sheet::text(&mut page, GAP as i32, 18 + 8 * scale as i32, &line, BLACK);
+        for (k, Panel { heading, view, captions }) in panels.iter().enumerate() {
+            let x = GAP + k as u32 * (shown + GAP);
+            sheet::title(&mut page, x as i32, top as i32 - 22, heading, 2, BLACK);
+            image::imageops::replace(&mut page, view, x.into(), top.into());
+            for (line, caption) in captions.iter().enumerate() {
+                sheet::text(&mut page, x as i32, below as i32 + 12 * line as i32, caption, BLACK);
+            }
+        }
+        let plot = self.losses([width - 2 * GAP, plot_height], step);
+        image::imageops::replace(&mut page, &plot, GAP.into(), (below + 36).into());
+        page
     }
 
     /// Loss, and error if the truth is known, of a chosen point.
@@ -216,7 +208,7 @@ impl Page<'_> {
                 _ => Curve { label: "", points, colour: FAINT },
             })
             .collect();
-        sheet::plot_curve("loss after each step", &curves, size, true)
+        sheet::plot_curve("loss at each step; starts that promise little are dropped", &curves, size, true)
     }
 }
 
