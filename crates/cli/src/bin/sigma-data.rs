@@ -12,7 +12,7 @@ use std::process::ExitCode;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-/// Data sets in the SRN folder layout: <set>/<instance>/{rgb,pose,intrinsics.txt}.
+/// Data sets in the SRN folder layout: SET/INSTANCE/{rgb,pose,intrinsics.txt}.
 #[derive(Parser)]
 #[command(version, about)]
 struct Cli {
