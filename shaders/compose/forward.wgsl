@@ -1,6 +1,6 @@
-// world_from_camera = motion · start: R = R_m R_s, t = R_m t_s + t_m.
+// world_from_camera = frame · motion · start, rigid motions as 3×4 matrices: (A B)[r] = Σ_k A[r,k] B[k] + (0, 0, 0, A[r,3]).
 // One invocation computes one pose.
-// motion, start [B, 12] → world_from_camera [B, 12], all 3×4 row-major.
+// frame, motion, start [B, 12] → world_from_camera [B, 12], all 3×4 row-major.
 // OVERWRITES world_from_camera.
 
 struct Params {
@@ -8,12 +8,20 @@ struct Params {
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> motion: array<f32>;
-@group(0) @binding(2) var<storage, read> start: array<f32>;
-@group(0) @binding(3) var<storage, read_write> world_from_camera: array<f32>;
+@group(0) @binding(1) var<storage, read> frame: array<f32>;
+@group(0) @binding(2) var<storage, read> motion: array<f32>;
+@group(0) @binding(3) var<storage, read> start: array<f32>;
+@group(0) @binding(4) var<storage, read_write> world_from_camera: array<f32>;
 
 fn start_row(at: u32) -> vec4<f32> {
     return vec4(start[at], start[at + 1u], start[at + 2u], start[at + 3u]);
+}
+
+// Row of motion · start, for the pose whose matrices begin at `at`.
+fn moved_row(at: u32, row: u32) -> vec4<f32> {
+    let m = at + 4u * row;
+    return motion[m] * start_row(at) + motion[m + 1u] * start_row(at + 4u) + motion[m + 2u] * start_row(at + 8u)
+        + vec4(0.0, 0.0, 0.0, motion[m + 3u]);
 }
 
 @compute @workgroup_size(64)
@@ -27,11 +35,12 @@ fn main(
         return;
     }
     let at = 12u * pose;
+    let moved = array(moved_row(at, 0u), moved_row(at, 1u), moved_row(at, 2u));
     for (var row = at; row < at + 12u; row += 4u) {
-        let product = motion[row] * start_row(at) + motion[row + 1u] * start_row(at + 4u) + motion[row + 2u] * start_row(at + 8u);
+        let product = frame[row] * moved[0] + frame[row + 1u] * moved[1] + frame[row + 2u] * moved[2];
         world_from_camera[row] = product.x;
         world_from_camera[row + 1u] = product.y;
         world_from_camera[row + 2u] = product.z;
-        world_from_camera[row + 3u] = product.w + motion[row + 3u];
+        world_from_camera[row + 3u] = product.w + frame[row + 3u];
     }
 }

@@ -61,12 +61,12 @@ table! {
     /// Chain rule from `d_world_from_camera [B,12]` to the six numbers `d_pose6 [B,6]`.
     POSE_BACKWARD = "pose"/"backward", PoseParams, tile FLAT,
         (pose6: f32, d_world_from_camera: f32) -> (d_pose6: f32);
-    /// `world_from_camera = motion · start`: `R = R_m R_s`, `t = R_m t_s + t_m`; all `[B,12]`, 3×4 row-major.
+    /// `world_from_camera = frame · motion · start`, rigid motions `[B,12]`, 3×4 row-major.
     COMPOSE_FORWARD = "compose"/"forward", PoseParams, tile FLAT,
-        (motion: f32, start: f32) -> (world_from_camera: f32);
-    /// `d_R_m = d_R R_sᵀ + d_t t_sᵀ`, `d_t_m = d_t`.
+        (frame: f32, motion: f32, start: f32) -> (world_from_camera: f32);
+    /// `d = R_fᵀ d_world_from_camera`; `d_motion[r,k] = ⟨d[r], start[k]⟩` for `k < 3`, `d_motion[r,3] = d[r,3]`.
     COMPOSE_BACKWARD = "compose"/"backward", PoseParams, tile FLAT,
-        (start: f32, d_world_from_camera: f32) -> (d_motion: f32);
+        (frame: f32, start: f32, d_world_from_camera: f32) -> (d_motion: f32);
     /// `q = ((u-cx)/fx, (v-cy)/fy, 1)`, `direction = normalize(R q)`, `origin = t + R (z0 q)`.
     /// `world_from_camera [images,12]`, `intrinsics [images,4]` (fx, fy, cx, cy), `uv [rows,2]`, `z0 [rows]` → `origin, direction [rows,3]`.
     RAYS_FORWARD = "rays"/"forward", RowsParams, tile FLAT,

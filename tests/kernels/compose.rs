@@ -10,8 +10,9 @@ pub static FORWARD: KernelTest = KernelTest {
     tolerance: 5e-7,
     cases: forward,
     faults: &[
-        ("forward", "product.w + motion[row + 3u]", "product.w - motion[row + 3u]"),
-        ("forward", "start_row(at + 8u)", "start_row(at + 4u)"),
+        ("forward", "product.w + frame[row + 3u]", "product.w - frame[row + 3u]"),
+        ("forward", "motion[m + 2u] * start_row(at + 8u)", "motion[m + 2u] * start_row(at + 4u)"),
+        ("forward", "frame[row + 2u] * moved[2]", "frame[row + 2u] * moved[1]"),
         ("forward", "12u * pose", "11u * pose"),
     ],
 };
@@ -24,6 +25,7 @@ pub static BACKWARD: KernelTest = KernelTest {
     faults: &[
         ("backward", "dot(d, start_row(at + 4u))", "dot(d.xyz, start_row(at + 4u).xyz)"),
         ("backward", "= d.w", "= d.z"),
+        ("backward", "frame[at + 4u + r]", "frame[at + 5u + r]"),
         ("backward", "12u * pose", "11u * pose"),
     ],
 };
@@ -44,10 +46,11 @@ fn forward() -> Vec<Case> {
 
 fn forward_case(count: u32) -> Case {
     let mut s = Sketch::new(format!("{count} poses"));
+    let frame = s.random("frame", 12 * count as usize);
     let motion = s.random("motion", 12 * count as usize);
     let start = s.random("start", 12 * count as usize);
     let world_from_camera = s.scratch("world_from_camera", 12 * count as usize);
-    s.step(|b| compose::forward(b, count, motion, start, world_from_camera));
+    s.step(|b| compose::forward(b, count, frame, motion, start, world_from_camera));
     s.finish()
 }
 
@@ -57,9 +60,10 @@ fn backward() -> Vec<Case> {
 
 fn backward_case(count: u32) -> Case {
     let mut s = Sketch::new(format!("{count} poses"));
+    let frame = s.random("frame", 12 * count as usize);
     let start = s.random("start", 12 * count as usize);
     let d_world_from_camera = s.random("d_world_from_camera", 12 * count as usize);
     let d_motion = s.scratch("d_motion", 12 * count as usize);
-    s.step(|b| compose::backward(b, count, start, d_world_from_camera, d_motion));
+    s.step(|b| compose::backward(b, count, frame, start, d_world_from_camera, d_motion));
     s.finish()
 }

@@ -183,8 +183,8 @@ macro_rules! references {
 references! {
     "pose/forward" => pose::forward(f) -> (f_mut);
     "pose/backward" => pose::backward(f f) -> (f_mut);
-    "compose/forward" => compose::forward(f f) -> (f_mut);
-    "compose/backward" => compose::backward(f f) -> (f_mut);
+    "compose/forward" => compose::forward(f f f) -> (f_mut);
+    "compose/backward" => compose::backward(f f f) -> (f_mut);
     "rays/forward" => rays::forward(f f f f) -> (f_mut f_mut);
     "rays/backward" => rays::backward(f f f f f f) -> (f_mut);
     "tile/gather" => tile::gather(f) -> (f_mut);

@@ -1,6 +1,6 @@
 //! One step of pose estimation for many hypotheses at once (spec 4): render, loss, gradient to the six numbers, Adam.
 
-use glam::DMat4;
+use glam::{DMat3, DMat4};
 use srn_plan::ops::{adam, compose, gmsd, image_loss, keep_best, pose, rays, tile as tile_ops};
 use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, tiles};
 
@@ -55,6 +55,7 @@ pub struct Shape {
 struct Handles {
     network: Network,
     target: BufferId,
+    frame: BufferId,
     start: BufferId,
     pose6: BufferId,
     d_pose6: BufferId,
@@ -74,8 +75,8 @@ pub struct Descent {
     runner: Runner,
     handles: Handles,
     shape: Shape,
-    /// What the motions are applied to; see [`Descent::set_starts`].
-    starts: Vec<DMat4>,
+    /// A pose is frame · motion · start; see [`Descent::set_starts`].
+    starts: Vec<(DMat4, DMat4)>,
     steps: u64,
 }
 
@@ -148,17 +149,25 @@ impl Descent {
 
     /// Sets the poses; the steps change their six numbers themselves, as in the paper. Forgets momentum and best steps.
     pub fn set_poses(&mut self, poses: &[Pose6]) -> Result<(), Error> {
-        self.set(poses, vec![DMat4::IDENTITY; poses.len()])
+        self.set(poses, vec![(DMat4::IDENTITY, DMat4::IDENTITY); poses.len()])
     }
 
-    /// Sets the poses; the steps change the six numbers of a motion about the object (the world origin) that is applied to
-    /// them, zero at first: the camera orbits when the angles change, and no start is at the Euler angles' singularity.
+    /// Sets the poses; the steps change the six numbers of a motion about the object (the world origin), in the axes of the
+    /// start's camera, zero at first. The camera orbits when the first two angles change; its distance, which an image shows
+    /// least, is a number of its own; and no start is at the Euler angles' singularity.
     pub fn set_starts(&mut self, starts: &[Pose6]) -> Result<(), Error> {
-        self.set(&vec![Pose6([0.0; 6]); starts.len()], starts.iter().map(|start| start.to_matrix()).collect())
+        let split = |start: &Pose6| {
+            let start = start.to_matrix();
+            let frame = DMat4::from_mat3(DMat3::from_mat4(start));
+            (frame, frame.transpose() * start)
+        };
+        self.set(&vec![Pose6([0.0; 6]); starts.len()], starts.iter().map(split).collect())
     }
 
-    fn set(&mut self, motions: &[Pose6], starts: Vec<DMat4>) -> Result<(), Error> {
-        let rows: Vec<f64> = starts.iter().flat_map(to_rows).collect();
+    fn set(&mut self, motions: &[Pose6], starts: Vec<(DMat4, DMat4)>) -> Result<(), Error> {
+        let frames: Vec<f64> = starts.iter().flat_map(|(frame, _)| to_rows(frame)).collect();
+        self.runner.write_f64(self.handles.frame, &frames)?;
+        let rows: Vec<f64> = starts.iter().flat_map(|(_, start)| to_rows(start)).collect();
         self.runner.write_f64(self.handles.start, &rows)?;
         self.starts = starts;
         let values: Vec<f64> = motions.iter().flat_map(|motion| motion.0).collect();
@@ -202,9 +211,10 @@ impl Descent {
 
     /// Where the motions take the starts.
     fn moved(&self, motions: &[[f64; 6]]) -> Vec<Pose6> {
-        let move_start = |(&motion, start): (&[f64; 6], &DMat4)| {
-            // Camera's own numbers: as they are, also where the same matrix has others.
-            if *start == DMat4::IDENTITY { Pose6(motion) } else { Pose6::from_matrix(&(Pose6(motion).to_matrix() * *start)) }
+        let move_start = |(&motion, (frame, start)): (&[f64; 6], &(DMat4, DMat4))| {
+            // The camera's own numbers stay as they are, also where the same matrix has others.
+            let own = *start == DMat4::IDENTITY;
+            if own { Pose6(motion) } else { Pose6::from_matrix(&(*frame * Pose6(motion).to_matrix() * *start)) }
         };
         motions.iter().zip(&self.starts).map(move_start).collect()
     }
@@ -254,7 +264,7 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u3
     let target = b.input("target rgb", values)?;
     let loss_buffer = b.scratch("loss", n)?;
     let pose6 = b.input("pose6", 6 * n)?;
-    let start = b.input("start", 12 * n)?;
+    let (frame, start) = (b.input("frame", 12 * n)?, b.input("start", 12 * n)?);
     let (motion, d_motion) = (b.scratch("motion", 12 * n)?, b.scratch("d motion", 12 * n)?);
     let (d_pose6, d_matrix) = (b.scratch("d pose6", 6 * n)?, b.scratch("d world_from_camera", 12 * n)?);
 
@@ -285,7 +295,7 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u3
     let evaluate = b.stage("evaluate");
     let mut started = Started::default();
     pose::forward(b, hypotheses, pose6, motion)?;
-    compose::forward(b, hypotheses, motion, start, network.world_from_camera)?;
+    compose::forward(b, hypotheses, frame, motion, start, network.world_from_camera)?;
     // A loss of whole images needs all tiles before the first gradient; the tiles are rendered once more on the way back.
     if let Comparison::Gmsd { saved: maps, d_response, d_rgb } = comparison {
         for &tile in &cut {
@@ -318,7 +328,7 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u3
     if let Comparison::PerPixel { kind, count, .. } = comparison {
         image_loss::forward(b, kind, hypotheses, rays_per_image, network.rgb, target, count, partial, loss_buffer)?;
     }
-    compose::backward(b, hypotheses, start, d_matrix, d_motion)?;
+    compose::backward(b, hypotheses, frame, start, d_matrix, d_motion)?;
     pose::backward(b, hypotheses, pose6, d_motion, d_pose6)?;
 
     let descend = b.stage("descend");
@@ -331,6 +341,7 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, loss: Loss, tile_rows: u3
     Ok(Handles {
         network,
         target,
+        frame,
         start,
         pose6,
         d_pose6,

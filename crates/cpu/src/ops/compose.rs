@@ -1,29 +1,42 @@
-//! A rigid motion after a start pose: `world_from_camera = motion · start`.
+//! A rigid motion of a start pose, in a given frame: `world_from_camera = frame · motion · start`, all 3×4 row-major.
 
 use srn_shaders::PoseParams;
 
 use crate::Real;
 
-/// `R = R_m R_s`, `t = R_m t_s + t_m`; all 3×4 row-major.
-pub fn forward<T: Real>(p: PoseParams, motion: &[T], start: &[T], world_from_camera: &mut [T]) {
-    let poses = motion.chunks_exact(12).zip(start.chunks_exact(12)).zip(world_from_camera.chunks_exact_mut(12));
-    for ((motion, start), out) in poses.take(p.poses as usize) {
-        for k in 0..12 {
-            let (row, column) = (k / 4 * 4, k % 4);
-            let product: f64 = (0..3).map(|inner| motion[row + inner].wide() * start[4 * inner + column].wide()).sum();
-            out[k] = T::of(product + if column == 3 { motion[row + 3].wide() } else { 0.0 });
-        }
+type Rigid = [[f64; 4]; 3];
+
+fn rigid<T: Real>(values: &[T]) -> Rigid {
+    [0, 1, 2].map(|row| [0, 1, 2, 3].map(|column| values[4 * row + column].wide()))
+}
+
+fn write<T: Real>(out: &mut [T], matrix: Rigid) {
+    for (out, &value) in out.iter_mut().zip(matrix.as_flattened()) {
+        *out = T::of(value);
     }
 }
 
-/// `d_R_m = d_R R_sᵀ + d_t t_sᵀ`, `d_t_m = d_t`.
-pub fn backward<T: Real>(p: PoseParams, start: &[T], d_world_from_camera: &[T], d_motion: &mut [T]) {
-    let poses = start.chunks_exact(12).zip(d_world_from_camera.chunks_exact(12)).zip(d_motion.chunks_exact_mut(12));
-    for ((start, d), d_motion) in poses.take(p.poses as usize) {
-        for k in 0..12 {
-            let (row, column) = (k / 4 * 4, k % 4);
-            let product = |inner: usize| d[row + inner].wide() * start[4 * column + inner].wide();
-            d_motion[k] = if column == 3 { d[k] } else { T::of((0..4).map(product).sum()) };
-        }
+fn product(a: &Rigid, b: &Rigid) -> Rigid {
+    let entry = |row: usize, column: usize| {
+        (0..3).map(|k| a[row][k] * b[k][column]).sum::<f64>() + if column == 3 { a[row][3] } else { 0.0 }
+    };
+    [0, 1, 2].map(|row| [0, 1, 2, 3].map(|column| entry(row, column)))
+}
+
+/// The product of the three.
+pub fn forward<T: Real>(p: PoseParams, frame: &[T], motion: &[T], start: &[T], world_from_camera: &mut [T]) {
+    for (pose, out) in world_from_camera.chunks_exact_mut(12).take(p.poses as usize).enumerate() {
+        let [frame, motion, start] = [frame, motion, start].map(|values| rigid(&values[12 * pose..]));
+        write(out, product(&frame, &product(&motion, &start)));
+    }
+}
+
+/// `d = R_fᵀ d_world_from_camera`; `d_motion[r,k] = ⟨d[r], start[k]⟩` for `k < 3`, `d_motion[r,3] = d[r,3]`.
+pub fn backward<T: Real>(p: PoseParams, frame: &[T], start: &[T], d_world_from_camera: &[T], d_motion: &mut [T]) {
+    for (pose, out) in d_motion.chunks_exact_mut(12).take(p.poses as usize).enumerate() {
+        let [frame, start, d] = [frame, start, d_world_from_camera].map(|values| rigid(&values[12 * pose..]));
+        let d: Rigid = [0, 1, 2].map(|r| [0, 1, 2, 3].map(|column| (0..3).map(|k| frame[k][r] * d[k][column]).sum()));
+        let entry = |r: usize, k: usize| if k == 3 { d[r][3] } else { (0..4).map(|c| d[r][c] * start[k][c]).sum() };
+        write(out, [0, 1, 2].map(|r| [0, 1, 2, 3].map(|k| entry(r, k))));
     }
 }

@@ -1,20 +1,21 @@
-//! A rigid motion about the world origin after a start pose: the object-centred way to move a camera.
+//! A rigid motion of a start pose, in a given frame: the object-centred way to move a camera.
 
 use srn_shaders::{COMPOSE_BACKWARD, COMPOSE_FORWARD, PoseParams};
 
 use super::{overwrite, read, size};
 use crate::{BufferId, Builder, PlanError};
 
-/// `motion, start [poses,12]` → `world_from_camera [poses,12]`.
+/// `frame · motion · start`, all `[poses,12]` → `world_from_camera [poses,12]`.
 pub fn forward(
     b: &mut Builder,
     poses: u32,
+    frame: BufferId,
     motion: BufferId,
     start: BufferId,
     world_from_camera: BufferId,
 ) -> Result<(), PlanError> {
     let n = size([poses, 12]);
-    let args = [read(motion, n), read(start, n), overwrite(world_from_camera, n)];
+    let args = [read(frame, n), read(motion, n), read(start, n), overwrite(world_from_camera, n)];
     b.step(&COMPOSE_FORWARD, PoseParams { poses }, &args, [poses, 1, 1], 3, 0)
 }
 
@@ -22,11 +23,12 @@ pub fn forward(
 pub fn backward(
     b: &mut Builder,
     poses: u32,
+    frame: BufferId,
     start: BufferId,
     d_world_from_camera: BufferId,
     d_motion: BufferId,
 ) -> Result<(), PlanError> {
     let n = size([poses, 12]);
-    let args = [read(start, n), read(d_world_from_camera, n), overwrite(d_motion, n)];
+    let args = [read(frame, n), read(start, n), read(d_world_from_camera, n), overwrite(d_motion, n)];
     b.step(&COMPOSE_BACKWARD, PoseParams { poses }, &args, [poses, 1, 1], 3, 0)
 }
