@@ -1,6 +1,110 @@
-//! The shipped model finds the poses of pictures that it has never seen.
+//! The shipped model finds the camera poses of pictures that it has never seen.
 
-/// Prints the table and writes the pictures.
-pub fn run(_: &[String]) -> Result<(), String> {
+use std::path::PathBuf;
+use std::process::{Command, ExitStatus, Output};
+use std::time::Instant;
+
+use crate::shell::{self, root};
+
+const MODEL: &str = "assets/models/compact.safetensors";
+const VIEWS: &str = "assets/dataset/test";
+/// Where the pictures go.
+const OUT: &str = "demo";
+/// Pictures whose pose is looked for with no idea of it.
+const LOST: [&str; 3] = ["forklift/rgb/000006", "chicken/rgb/000011", "steering/rgb/000003"];
+/// The object that both executors look at.
+const SHARED: &str = "chicken";
+
+/// Prints the table, writes the pictures, and compares the executors where there is an adapter.
+pub fn run(arguments: &[String]) -> Result<(), String> {
+    let model = arguments.first().map_or(MODEL, String::as_str);
+    if !root().join(model).exists() {
+        return Err(format!("{model} is missing"));
+    }
+    shell::run(shell::cargo().args(["build", "--release", "--bin", "sigma-pose"]))?;
+    let begin = Instant::now();
+
+    println!("\nUnseen views, searched from 30° beside the true pose (neighbor4):\n");
+    let mut evaluate = sigma_pose("evaluate", model, "cpu");
+    evaluate.args(["--data", VIEWS, "--starts", "neighbor4", "--views", "1", "--force", "--out", &format!("{OUT}/neighbor4")]);
+    accept(evaluate.status())?;
+
+    println!("\nUnseen views, with no idea where the camera is (fixed24: from all around the object):\n");
+    let mut estimate = sigma_pose("estimate", model, "cpu");
+    estimate.args(LOST.map(|name| format!("{VIEWS}/{name}.png")));
+    estimate.args(["--starts", "fixed24", "--truth", "auto", "--force", "--record", &format!("{OUT}/fixed24")]);
+    accept(estimate.status())?;
+
+    println!("\nThe pose found for {SHARED}, refined by both executors:\n");
+    compare(model)?;
+    println!("\n{:.0} s. Pictures: {}", begin.elapsed().as_secs_f64(), root().join(OUT).display());
     Ok(())
+}
+
+/// Goes on from a pose that was found, on the CPU and, where there is an adapter, on the GPU; they must agree to 0.1°.
+///
+/// Small steps, since a whole search multiplies differences in the last digit until they are seen.
+fn compare(model: &str) -> Result<(), String> {
+    let results = read(&format!("{OUT}/neighbor4/results.json"))?;
+    let found = results.split(&format!("\"instance\": \"{SHARED}\"")).nth(1).unwrap_or_default();
+    let view = found.split('"').skip_while(|&text| text != "view").nth(2).unwrap_or_default();
+    let (picture, start) = (format!("{VIEWS}/{SHARED}/rgb/{view}.png"), format!("{OUT}/start.txt"));
+    let before = matrix(found)?;
+    let text = before.map(|number| number.to_string()).join(" ");
+    std::fs::write(root().join(&start), text).map_err(|error| format!("{start}: {error}"))?;
+    let refine = |executor: &str| -> Result<Output, String> {
+        let mut command = sigma_pose("estimate", model, executor);
+        command
+            .args([&picture, "--starts", &start, "--truth", "auto", "--stride", "4", "--steps", "30", "--lr", "0.002", "--json"]);
+        command.output().map_err(|error| format!("sigma-pose: {error}"))
+    };
+    let (cpu, gpu) = (refine("cpu")?, refine("gpu")?);
+    if String::from_utf8_lossy(&gpu.stderr).contains("no GPU adapter") {
+        println!("only by the CPU executor: there is no GPU adapter here");
+        return Ok(());
+    }
+    let pose = |output: &Output| {
+        matrix(&String::from_utf8_lossy(&output.stdout)).map_err(|what| what + &String::from_utf8_lossy(&output.stderr))
+    };
+    let (cpu, gpu) = (pose(&cpu)?, pose(&gpu)?);
+    let (rotation, translation) = difference(&cpu, &gpu);
+    println!("30 small steps moved it by {:.2}°;", difference(&before, &cpu).0);
+    println!("the CPU executor's pose and the GPU executor's differ by {rotation:.4}° and {translation:.5} object units");
+    if rotation < 0.1 { Ok(()) } else { Err(format!("the executors differ by {rotation:.3}°, more than 0.1°")) }
+}
+
+fn read(path: &str) -> Result<String, String> {
+    std::fs::read_to_string(root().join(path)).map_err(|error| format!("{path}: {error}"))
+}
+
+/// The numbers of the first `world_from_camera` in a JSON text.
+fn matrix(json: &str) -> Result<[f64; 16], String> {
+    let rest = json.split("\"world_from_camera\"").nth(1).unwrap_or_default();
+    let numbers = rest.split(|c: char| !(c.is_ascii_digit() || "+-.eE".contains(c))).filter_map(|text| text.parse().ok());
+    let numbers: Vec<f64> = numbers.take(16).collect();
+    numbers.try_into().map_err(|_| "sigma-pose printed no pose\n".into())
+}
+
+/// Angle in degrees between two rotations, distance of two camera centres.
+fn difference(a: &[f64; 16], b: &[f64; 16]) -> (f64, f64) {
+    let distance = |places: &[usize]| places.iter().map(|&k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt();
+    // ‖A - B‖ = 2 √2 sin(angle / 2), which unlike the trace keeps the digits of small angles.
+    let rotation = distance(&[0, 1, 2, 4, 5, 6, 8, 9, 10]) / 8f64.sqrt();
+    (2.0 * rotation.min(1.0).asin().to_degrees(), distance(&[3, 7, 11]))
+}
+
+fn sigma_pose(command: &str, model: &str, executor: &str) -> Command {
+    let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from);
+    let mut program = shell::program(target.join("release").join(format!("sigma-pose{}", std::env::consts::EXE_SUFFIX)));
+    program.args([command, "--model", model, "--executor", executor]);
+    program
+}
+
+/// A pose that was not found, exit code 1, is a result too.
+fn accept(status: std::io::Result<ExitStatus>) -> Result<(), String> {
+    match status {
+        Ok(status) if status.code().is_some_and(|code| code < 2) => Ok(()),
+        Ok(status) => Err(format!("sigma-pose: {status}")),
+        Err(error) => Err(format!("sigma-pose: {error}")),
+    }
 }

@@ -17,7 +17,7 @@ struct Command {
 }
 
 const COMMANDS: &[Command] = &[
-    Command { name: "demo", arguments: "", about: "find poses of unseen pictures with the shipped model", run: demo::run },
+    Command { name: "demo", arguments: "[MODEL]", about: "find poses of unseen pictures with the shipped model", run: demo::run },
     Command { name: "test", arguments: "", about: "every test, GPU tests included", run: checks::test },
     Command { name: "lint", arguments: "", about: "formatting, clippy, documentation; warnings are errors", run: checks::lint },
     Command { name: "ci", arguments: "", about: "everything that CI checks, the cheapest first", run: checks::ci },
