@@ -10,7 +10,7 @@ pub fn lint(_: &[String]) -> Result<(), String> {
     shell::run(cargo().args(["fmt", "--all", "--check"]))?;
     shell::run(cargo().args(["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"]))?;
     let mut doc = cargo();
-    doc.args(["doc", "--quiet", "--release", "--workspace", "--no-deps", "--document-private-items"]);
+    doc.args(["doc", "--quiet", "--release", "--workspace", "--no-deps"]);
     shell::run(doc.env("RUSTDOCFLAGS", "-D warnings"))
 }
 
