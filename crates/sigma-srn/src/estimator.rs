@@ -71,12 +71,14 @@ impl Options {
         Options { loss: Loss::Mae, phases: vec![phase], frame: Frame::Camera, keep_best: false, seed: 0 }
     }
 
-    /// Steps about the object; all starts on few rays, the six most promising ones on more, the best two to the end.
+    /// Steps about the object; all starts on few rays, the six most promising ones on more, the best
+    /// one to the end on all.
     pub fn culled() -> Self {
         let phases = vec![
             Phase { steps: 30, stride: 4, learning_rate: (0.05, 0.05), keep: usize::MAX },
-            Phase { steps: 50, stride: 3, learning_rate: (0.05, 0.03), keep: 6 },
-            Phase { steps: 60, stride: 2, learning_rate: (0.03, 0.002), keep: 2 },
+            Phase { steps: 40, stride: 3, learning_rate: (0.05, 0.03), keep: 6 },
+            Phase { steps: 40, stride: 2, learning_rate: (0.03, 0.005), keep: 2 },
+            Phase { steps: 40, stride: 1, learning_rate: (0.01, 0.0005), keep: 1 },
         ];
         Options { loss: Loss::Mae, phases, frame: Frame::Object, keep_best: true, seed: 0 }
     }

@@ -28,7 +28,8 @@ vectorised! {
             let rstd = T::one() / (variance + T::of(EPSILON)).sqrt();
             for (((y, &x), &gamma), &beta) in y.iter_mut().zip(x).zip(gamma).zip(beta) {
                 let value = (x - mean) * rstd * gamma + beta;
-                *y = if value > T::zero() { value } else { T::zero() };
+                // A NaN is no number to hide: it goes on.
+                *y = if value < T::zero() { T::zero() } else { value };
             }
             stats[0] = mean;
             stats[1] = rstd;
