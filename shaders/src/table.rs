@@ -157,7 +157,7 @@ table! {
     /// `d_rgb = scale · normaliser · sign(e)` or `· 2e`; `sign(0) = 0`. Extent: values.
     IMAGE_LOSS_BACKWARD = "image_loss"/"backward", ImageLossParams, tile FLAT,
         (rgb: f32, target_rgb: f32, count: f32) -> (d_rgb: f32);
-    /// To [0,1] (not clamped), YIQ luma `0.299 R + 0.587 G + 0.114 B`, 2×2 average: `rgb [images, height, width, 3]` → `luma [images, h2, w2]`,
+    /// To `[0,1]` (not clamped), YIQ luma `0.299 R + 0.587 G + 0.114 B`, 2×2 average: `rgb [images, height, width, 3]` → `luma [images, h2, w2]`,
     /// `h2 = height / 2`, `w2 = width / 2` rounded down. Extent: images · h2 · w2, as for the next ones.
     GMSD_POOL = "gmsd"/"pool", GmsdParams, tile FLAT,
         (rgb: f32) -> (luma: f32);
@@ -188,7 +188,7 @@ table! {
     /// Where `loss[b] < best_loss[b]`: keeps loss and pose. `pose6 [B,6]`. Extent: poses.
     KEEP_BEST_STEP = "keep_best"/"step", KeepBestParams, tile FLAT,
         (loss: f32, pose6: f32) -> (best_loss: f32, best_pose6: f32);
-    /// RGB in [-1,1] to packed RGBA8 (r in the low byte, alpha 255), clamped and rounded: `rgb [.., 3]` → `packed [height, stride]`. Extent: width · height.
+    /// RGB in `[-1,1]` to packed RGBA8 (r in the low byte, alpha 255), clamped and rounded: `rgb [.., 3]` → `packed [height, stride]`. Extent: width · height.
     PACK_RGBA8_FORWARD = "pack_rgba8"/"forward", PackParams, tile FLAT,
         (rgb: f32) -> (packed: u32);
 }
