@@ -44,16 +44,23 @@ fn run() -> Result<bool, String> {
         return Err(format!("{}: no .safetensors files", folder.display()));
     }
     println!("{:<14} {:<6} {:<20} {:>9} {:>9}  worst in", "file", "on", "quantity", "worst", "limit");
-    let mut all_pass = true;
+    let (mut all_pass, mut by_chance) = (true, 0);
     for file in &files {
         let name = file.file_stem().unwrap_or_default().to_string_lossy();
         for (engine_name, engine, limits) in &engines {
             for figure in check(engine, file, *limits)? {
                 all_pass &= figure.passes();
+                by_chance += usize::from(figure.passes() && figure.worst > figure.limit);
                 println!("{name:<14} {engine_name:<6} {figure}");
             }
         }
     }
-    println!("{}", if all_pass { "every figure is within its limit" } else { "some figures exceed their limits" });
+    match (all_pass, by_chance) {
+        (false, _) => println!("some figures exceed their limits"),
+        (true, 0) => println!("every figure is within its limit"),
+        (true, _) => println!(
+            "{by_chance} figures exceed their limit, but not what f64 makes of weights that are one f32 away; all others are within"
+        ),
+    }
     Ok(all_pass)
 }
