@@ -56,7 +56,7 @@ macro_rules! params {
 }
 
 params! {
-    /// `pose/*`, `compose/*`: number of poses.
+    /// `pose/*`, `levenberg_marquardt/accept` and `/solve`: number of poses.
     PoseParams {
         /// Number of poses.
         poses: u32,
@@ -225,10 +225,26 @@ params! {
         /// 1: add to the output, 0: overwrite it.
         accumulate: u32,
     }
-    /// `keep_best/step`.
-    KeepBestParams {
-        /// Number of poses.
-        poses: u32,
+    /// `levenberg_marquardt/equations`: rows of a tile, and the residual of one channel.
+    EquationsParams {
+        /// Images in this tile.
+        groups: u32,
+        /// Rows of each image in this tile.
+        rows_per_group: u32,
+        /// Number of the tile's first image.
+        first_group: u32,
+        /// Rows per partial sum.
+        chunk_rows: u32,
+        /// Partial sums per image: `ceil(rows_per_group / chunk_rows)`.
+        chunks: u32,
+        /// 0 red, 1 green, 2 blue.
+        channel: u32,
+        /// What the backward pass began with: gradients are those of `seed · rgb[channel]`.
+        seed: f32,
+        /// Factor on weights and loss.
+        scale: f32,
+        /// Residual at which the loss turns from squares to absolute values.
+        soft: f32,
     }
     /// `pack_rgba8/forward`.
     PackParams {

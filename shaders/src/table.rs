@@ -61,12 +61,6 @@ table! {
     /// Chain rule from `d_world_from_camera [B,12]` to the six numbers `d_pose6 [B,6]`.
     POSE_BACKWARD = "pose"/"backward", PoseParams, tile FLAT,
         (pose6: f32, d_world_from_camera: f32) -> (d_pose6: f32);
-    /// `world_from_camera = frame · motion · start`, rigid motions `[B,12]`, 3×4 row-major.
-    COMPOSE_FORWARD = "compose"/"forward", PoseParams, tile FLAT,
-        (frame: f32, motion: f32, start: f32) -> (world_from_camera: f32);
-    /// `d = R_fᵀ d_world_from_camera`; `d_motion[r,k] = ⟨d[r], start[k]⟩` for `k < 3`, `d_motion[r,3] = d[r,3]`.
-    COMPOSE_BACKWARD = "compose"/"backward", PoseParams, tile FLAT,
-        (frame: f32, start: f32, d_world_from_camera: f32) -> (d_motion: f32);
     /// `q = ((u-cx)/fx, (v-cy)/fy, 1)`, `direction = normalize(R q)`, `origin = t + R (z0 q)`.
     /// `world_from_camera [images,12]`, `intrinsics [images,4]` (fx, fy, cx, cy), `uv [rows,2]`, `z0 [rows]` → `origin, direction [rows,3]`.
     RAYS_FORWARD = "rays"/"forward", RowsParams, tile FLAT,
@@ -185,9 +179,17 @@ table! {
     /// `y[first_group + g, j] (+)= Σ_t x[g, t, j]`; `x [groups, terms, count]`. Extent: groups · count.
     SUM_FORWARD = "sum"/"forward", SumParams, tile FLAT,
         (x: f32) -> (y: f32);
-    /// Where `loss[b] < best_loss[b]`: keeps loss and pose. `pose6 [B,6]`. Extent: poses.
-    KEEP_BEST_STEP = "keep_best"/"step", KeepBestParams, tile FLAT,
-        (loss: f32, pose6: f32) -> (best_loss: f32, best_pose6: f32);
+    /// Normal equations of one channel's residuals over a motion `ξ` about the object, in the camera's axes: per chunk of an image's
+    /// rows the upper triangle of `A = Σ w J Jᵀ` (21 values), `g = Σ w e J` (6) and the loss `scale Σ ρ(e)` (1), `ρ = √(e² + s²) - s`.
+    /// `origin, direction, d_origin, d_direction, rgb, target_rgb [rows,3]` → `partial [groups, chunks, 28]`.
+    LEVENBERG_MARQUARDT_EQUATIONS = "levenberg_marquardt"/"equations", EquationsParams, tile FLAT,
+        (world_from_camera: f32, origin: f32, direction: f32, d_origin: f32, d_direction: f32, rgb: f32, target_rgb: f32) -> (partial: f32);
+    /// Where the trial's loss is lower, keeps its equations and pose, and damps less; elsewhere damps more. Extent: poses.
+    LEVENBERG_MARQUARDT_ACCEPT = "levenberg_marquardt"/"accept", PoseParams, tile FLAT,
+        (equations: f32, world_from_camera: f32) -> (best_equations: f32, best_pose: f32, damping: f32);
+    /// The next trial: `(A + damping diag A) ξ = -g`, `|ξ| ≤ 0.5`, `pose` moved by `ξ`. Extent: poses.
+    LEVENBERG_MARQUARDT_SOLVE = "levenberg_marquardt"/"solve", PoseParams, tile FLAT,
+        (equations: f32, pose: f32, damping: f32) -> (world_from_camera: f32);
     /// RGB in `[-1,1]` to packed RGBA8 (r in the low byte, alpha 255), clamped and rounded: `rgb [.., 3]` → `packed [height, stride]`. Extent: width · height.
     PACK_RGBA8_FORWARD = "pack_rgba8"/"forward", PackParams, tile FLAT,
         (rgb: f32) -> (packed: u32);

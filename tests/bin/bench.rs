@@ -7,8 +7,8 @@ use std::process::ExitCode;
 use std::time::{Instant, SystemTime};
 
 use sigma_srn::{
-    Descent, Engine, Gpu, Intrinsics, Loss, Model, ModelConfig, Pose6, Rays, Renderer, Shape, Train, Trainer, TrainingBatch,
-    camera, pixel_grid, stream,
+    Descent, Engine, Gpu, Intrinsics, Loss, Method, Model, ModelConfig, Pose6, Rays, Renderer, Shape, Train, Trainer,
+    TrainingBatch, camera, pixel_grid, stream,
 };
 use srn_tests::between;
 
@@ -158,13 +158,13 @@ impl Bench<'_> {
 
     fn pose_step(&mut self) -> Result<(Row, Vec<KernelRow>)> {
         let shape = Shape { hypotheses: BATCH, width: SIDE, height: SIDE, instances: 1 };
-        let mut descent = Descent::new(self.engine, self.model, shape, Loss::Mae)?;
+        let mut descent = Descent::new(self.engine, self.model, shape, Method::Adam { loss: Loss::Mae, learning_rate: 0.01 })?;
         descent.set_targets(&[0], &[0; BATCH as usize], &rays(BATCH, RAYS), &target(3 * BATCH * RAYS))?;
         let poses: Vec<Pose6> = camera::fixed24(1.3).iter().take(BATCH as usize).map(Pose6::from_matrix).collect();
         descent.set_poses(&poses)?;
         let time = self.measure(|| {
             descent.evaluate()?;
-            descent.descend(0.01)?;
+            descent.descend()?;
             descent.losses()?;
             Ok(())
         })?;

@@ -7,7 +7,7 @@ use std::path::Path;
 use rand::RngExt;
 use safetensors::tensor::{Dtype, SafeTensors};
 use sigma_srn::camera::to_rows;
-use sigma_srn::{Descent, Engine, Loss, Model, Pose6, Rays, Shape, Train, Trainer, TrainingBatch, stream};
+use sigma_srn::{Descent, Engine, Loss, Method, Model, Pose6, Rays, Shape, Train, Trainer, TrainingBatch, stream};
 use srn_plan::Executor;
 
 /// How far a quantity is from the golden value, relative to the tensor's largest value, and how far it may be.
@@ -267,14 +267,14 @@ fn training(engine: &Engine, report: &mut Report) -> Result<(), String> {
     Ok(())
 }
 
-fn descent(engine: &Engine, report: &Report, loss: Loss, start: &str) -> Result<Descent, String> {
+fn descent(engine: &Engine, report: &Report, loss: Loss, learning_rate: f64, start: &str) -> Result<Descent, String> {
     let golden = report.golden;
     let images = golden.images();
     let shape = Shape { hypotheses: images, width: golden.side, height: golden.side, instances: images };
     let slots: Vec<u32> = (0..images).collect();
     let batch = golden.batch()?;
     let ready = || {
-        let mut descent = Descent::new(engine, &golden.model, shape, loss)?;
+        let mut descent = Descent::new(engine, &golden.model, shape, Method::Adam { loss, learning_rate })?;
         descent.set_targets(&golden.index, &slots, &batch.rays, &batch.target_rgb)?;
         Ok(descent)
     };
@@ -286,7 +286,7 @@ fn descent(engine: &Engine, report: &Report, loss: Loss, start: &str) -> Result<
 fn pose_gradients(engine: &Engine, report: &mut Report) -> Result<(), String> {
     let kinds = [Loss::Mae, Loss::Mse, Loss::Gmsd, Loss::NormL1, Loss::NormL2];
     for (name, loss) in ["mae", "mse", "gmsd", "norm_l1", "norm_l2"].into_iter().zip(kinds) {
-        let mut descent = descent(engine, report, loss, "in.pose6")?;
+        let mut descent = descent(engine, report, loss, 0.1, "in.pose6")?;
         descent.evaluate().map_err(|error| report.error(error))?;
         let losses: Vec<f32> = descent.losses().map_err(|error| report.error(error))?.iter().map(|&loss| loss as f32).collect();
         report.compare("pose losses", &format!("pose.{name}.loss"), &losses, report.limits.output)?;
@@ -301,13 +301,13 @@ fn refinement(engine: &Engine, report: &mut Report) -> Result<(), String> {
     for learning_rate in ["0.1", "0.01"] {
         let tensor = |part: &str| format!("refine.lr{learning_rate}.{part}");
         let rate = learning_rate.parse().map_err(|error| format!("{learning_rate}: {error}"))?;
-        let mut descent = descent(engine, report, Loss::Mae, &tensor("start"))?;
+        let mut descent = descent(engine, report, Loss::Mae, rate, &tensor("start"))?;
         let steps = report.golden.get(&tensor("losses"))?.len() / report.golden.images() as usize;
         let (mut losses, mut path) = (Vec::new(), Vec::new());
         for _ in 0..steps {
             descent.evaluate().map_err(|error| report.error(error))?;
             losses.extend(descent.losses().map_err(|error| report.error(error))?.into_iter().map(|loss| loss as f32));
-            descent.descend(rate).map_err(|error| report.error(error))?;
+            descent.descend().map_err(|error| report.error(error))?;
             path.extend(descent.poses().map_err(|error| report.error(error))?.into_iter().flat_map(Pose6::to_f32));
         }
         report.compare("refinement losses", &tensor("losses"), &losses, report.limits.refinement)?;

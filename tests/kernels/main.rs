@@ -10,7 +10,6 @@ use srn_tests::{Case, Divergence, gpu, lockstep};
 
 mod adam;
 mod advance;
-mod compose;
 mod density_sum;
 mod depth;
 mod depth_loss;
@@ -18,9 +17,9 @@ mod embedding;
 mod executor;
 mod gmsd;
 mod image_loss;
-mod keep_best;
 mod latent_loss;
 mod layer_norm_relu;
+mod levenberg_marquardt;
 mod linear;
 mod lockstep;
 mod lstm_cell;
@@ -48,8 +47,6 @@ type Fault = (&'static str, &'static str, &'static str);
 static ALL: &[&KernelTest] = &[
     &pose::FORWARD,
     &pose::BACKWARD,
-    &compose::FORWARD,
-    &compose::BACKWARD,
     &rays::FORWARD,
     &rays::BACKWARD,
     &tile::GATHER,
@@ -84,7 +81,9 @@ static ALL: &[&KernelTest] = &[
     &gmsd::BACKWARD_POOL,
     &adam::STEP,
     &sum::FORWARD,
-    &keep_best::STEP,
+    &levenberg_marquardt::EQUATIONS,
+    &levenberg_marquardt::ACCEPT,
+    &levenberg_marquardt::SOLVE,
     &pack_rgba8::FORWARD,
 ];
 

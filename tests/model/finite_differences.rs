@@ -1,8 +1,9 @@
 //! The reference in `f64` against central differences: every parameter of a training step, every number of a pose.
 
-use sigma_srn::{Engine, Train, Trainer, TrainingBatch};
+use glam::{DMat3, DMat4, DVec3};
+use sigma_srn::{Engine, Method, Pose6, Train, Trainer, TrainingBatch};
 
-use crate::{LOSSES, RAYS, batch, buffer, descent, model, poses, trainer};
+use crate::{RAYS, batch, buffer, descent, methods, model, poses, trainer};
 
 /// Far above the rounding of `f64`, and so small that hardly a hidden unit changes sides of its ReLU on the way.
 const STEP: f64 = 1e-6;
@@ -43,13 +44,13 @@ fn parameters(density: bool) {
         let largest = gradient.iter().position(|d| d.abs() == scale).unwrap();
         let between = (1..6).map(|k| k * 7919 % values.len());
         for at in [0, values.len() - 1, largest].into_iter().chain(between) {
-            let mut moved = |by: f64| {
+            let mut losses_at = |by: f64| {
                 let mut values = values.clone();
                 values[at] += by;
                 trainer.executor().write_f64(parameter, &values).unwrap();
                 total(&mut trainer, &batch)
             };
-            let difference = (moved(STEP) - moved(-STEP)) / (2.0 * STEP);
+            let difference = (losses_at(STEP) - losses_at(-STEP)) / (2.0 * STEP);
             let error = (difference - gradient[at]).abs() / scale;
             if error > worst.0 {
                 worst = (error, format!("{name}[{at}]: gradient {}, difference {difference}", gradient[at]));
@@ -88,35 +89,53 @@ fn codes_alone_get_the_same_gradient() {
 }
 
 #[test]
-fn of_every_number_of_a_pose_in_every_loss() {
+fn of_every_number_of_a_pose_in_every_method() {
     const HYPOTHESES: u32 = 4;
-    for loss in LOSSES {
-        let mut descent = descent(&Engine::cpu_f64(), loss, HYPOTHESES);
+    for method in methods() {
+        let mut descent = descent(&Engine::cpu_f64(), method, HYPOTHESES);
         let start = poses(HYPOTHESES);
         descent.evaluate().unwrap();
         let gradients = descent.gradients().unwrap();
         let mut worst = 0.0f64;
         for number in 0..6 {
             // Every hypothesis has a loss of its own: all move at once, each in its own direction.
-            let mut moved = |by: f64| {
+            let mut losses_at = |by: f64| {
                 let mut poses = start.clone();
                 for (k, pose) in poses.iter_mut().enumerate() {
-                    pose.0[number] += if k % 2 == 0 { by } else { -by };
+                    *pose = moved(pose, method, number, if k % 2 == 0 { by } else { -by });
                 }
                 descent.set_poses(&poses).unwrap();
                 descent.evaluate().unwrap();
-                let losses = buffer(descent.executor(), "loss");
-                descent.executor().read_f64(losses).unwrap()
+                // The loss is the last of Levenberg–Marquardt's 28 values per pose.
+                let name = if matches!(method, Method::Adam { .. }) { "loss" } else { "equations" };
+                let losses = buffer(descent.executor(), name);
+                let values = descent.executor().read_f64(losses).unwrap();
+                let each = values.len() / HYPOTHESES as usize;
+                values.chunks(each).map(|values| values[each - 1]).collect::<Vec<f64>>()
             };
-            let (ahead, behind) = (moved(STEP), moved(-STEP));
+            let (ahead, behind) = (losses_at(STEP), losses_at(-STEP));
             for (k, gradient) in gradients.iter().enumerate() {
                 let difference = (ahead[k] - behind[k]) / (2.0 * STEP) * if k % 2 == 0 { 1.0 } else { -1.0 };
                 let scale = gradient.iter().fold(0.0, |most: f64, d| most.max(d.abs()));
                 let error = (difference - gradient[number]).abs() / scale;
-                assert!(error < TOLERANCE, "{loss:?}, hypothesis {k}, number {number}: {} and {difference}", gradient[number]);
+                assert!(error < TOLERANCE, "{method:?}, hypothesis {k}, number {number}: {} and {difference}", gradient[number]);
                 worst = worst.max(error);
             }
         }
-        println!("worst {worst:.1e}: {loss:?} over {RAYS} rays");
+        println!("worst {worst:.1e}: {method:?} over {RAYS} rays");
     }
+}
+
+/// A pose with one of the numbers changed that a step of the method changes.
+fn moved(pose: &Pose6, method: Method, number: usize, by: f64) -> Pose6 {
+    if matches!(method, Method::Adam { .. }) {
+        let mut numbers = pose.0;
+        numbers[number] += by;
+        return Pose6(numbers);
+    }
+    // A motion about the world's origin, in the axes of the camera.
+    let axes = DMat4::from_mat3(DMat3::from_mat4(pose.to_matrix()));
+    let axis = DVec3::AXES[number % 3];
+    let motion = if number < 3 { DMat4::from_axis_angle(axis, by) } else { DMat4::from_translation(by * axis) };
+    Pose6::from_matrix(&(axes * motion * axes.transpose() * pose.to_matrix()))
 }

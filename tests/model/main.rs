@@ -1,8 +1,8 @@
 //! The whole model: against golden values, finite differences and itself (other tiles, other executors), and what it does.
 
 use sigma_srn::{
-    Descent, Engine, Intrinsics, Loss, Model, ModelConfig, Pose6, Rays, Shape, Train, Trainer, TrainingBatch, camera, pixel_grid,
-    stream,
+    Descent, Engine, Intrinsics, Loss, Method, Model, ModelConfig, Pose6, Rays, Shape, Train, Trainer, TrainingBatch, camera,
+    pixel_grid, stream,
 };
 use srn_plan::{BufferId, Executor};
 
@@ -55,10 +55,16 @@ fn trainer(engine: &Engine, model: Model, train: Train, images: u32) -> Trainer 
     Trainer::new(engine, model, train, images, RAYS).unwrap()
 }
 
+/// Every way to move: the paper's with every loss, and Levenberg–Marquardt.
+fn methods() -> Vec<Method> {
+    let adam = |loss| Method::Adam { loss, learning_rate: 0.01 };
+    LOSSES.into_iter().map(adam).chain([Method::LevenbergMarquardt { soft: 0.3 }]).collect()
+}
+
 /// A descent from [`poses`], ready to be evaluated; all instances but the first are looked for.
-fn descent(engine: &Engine, loss: Loss, hypotheses: u32) -> Descent {
+fn descent(engine: &Engine, method: Method, hypotheses: u32) -> Descent {
     let shape = Shape { hypotheses, width: SIZE[0], height: SIZE[1], instances: INSTANCES - 1 };
-    let mut descent = Descent::new(engine, &model(true), shape, loss).unwrap();
+    let mut descent = Descent::new(engine, &model(true), shape, method).unwrap();
     let batch = batch(hypotheses);
     let instances: Vec<u32> = (1..INSTANCES).collect();
     let slots: Vec<u32> = batch.instances.iter().map(|instance| instance - 1).collect();

@@ -183,8 +183,6 @@ macro_rules! references {
 references! {
     "pose/forward" => pose::forward(f) -> (f_mut);
     "pose/backward" => pose::backward(f f) -> (f_mut);
-    "compose/forward" => compose::forward(f f f) -> (f_mut);
-    "compose/backward" => compose::backward(f f f) -> (f_mut);
     "rays/forward" => rays::forward(f f f f) -> (f_mut f_mut);
     "rays/backward" => rays::backward(f f f f f f) -> (f_mut);
     "tile/gather" => tile::gather(f) -> (f_mut);
@@ -219,6 +217,8 @@ references! {
     "gmsd/backward_pool" => gmsd::backward_pool(f) -> (f_mut);
     "adam/step" => adam::step(f f) -> (f_mut f_mut f_mut);
     "sum/forward" => sum::forward(f) -> (f_mut);
-    "keep_best/step" => keep_best::step(f f) -> (f_mut f_mut);
+    "levenberg_marquardt/equations" => levenberg_marquardt::equations(f f f f f f f) -> (f_mut);
+    "levenberg_marquardt/accept" => levenberg_marquardt::accept(f f) -> (f_mut f_mut f_mut);
+    "levenberg_marquardt/solve" => levenberg_marquardt::solve(f f f) -> (f_mut);
     "pack_rgba8/forward" => pack_rgba8::forward(f) -> (u_mut);
 }

@@ -19,7 +19,7 @@ fn main() -> Result<(), sigma_srn::Error> {
     let rgb = Renderer::new(&engine, &model, 1, SIDE, SIDE)?.render(&[0], &[(truth, intrinsics)], 0)?.rgb;
 
     let query = Query { instance: 0, rgb, width: SIDE, height: SIDE, intrinsics, starts: camera::neighbor4(&truth) };
-    let estimates = estimate(&engine, &model, &[query], &Options::culled(), |progress| {
+    let estimates = estimate(&engine, &model, &[query], &Options::default(), |progress| {
         if progress.step % 50 == 0 {
             println!("step {} of {}: {} hypotheses", progress.step, progress.steps, progress.hypotheses.len());
         }

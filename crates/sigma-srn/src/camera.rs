@@ -1,6 +1,6 @@
 //! Cameras and poses (spec 1): OpenCV axes, `world_from_camera`, world z up, the object at the origin.
 
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat3, DMat4, DQuat, DVec3};
 
 /// Pinhole intrinsics in pixels, with the place of a pixel's centre.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -66,18 +66,27 @@ pub fn look_at_origin(eye: DVec3) -> DMat4 {
     DMat4::from_cols(right.extend(0.0), forward.cross(right).extend(0.0), forward.extend(0.0), eye.extend(1.0))
 }
 
+/// Cameras at `radius` that look at the origin without roll, `azimuths` of them at each elevation.
+fn rings(radius: f64, elevations_deg: &[f64], azimuths: u32) -> Vec<DMat4> {
+    let ring = |elevation: &f64| {
+        let (z, horizontal) = elevation.to_radians().sin_cos();
+        (0..azimuths).map(move |k| {
+            let (y, x) = (f64::from(k) * std::f64::consts::TAU / f64::from(azimuths)).sin_cos();
+            look_at_origin(radius * DVec3::new(horizontal * x, horizontal * y, z))
+        })
+    };
+    elevations_deg.iter().flat_map(ring).collect()
+}
+
 /// Starts `fixed24` (spec 4): 8 azimuths × elevations 45°, 0°, −45° at `radius`, looking at the origin.
 pub fn fixed24(radius: f64) -> Vec<DMat4> {
-    [45.0f64, 0.0, -45.0]
-        .into_iter()
-        .flat_map(|elevation| {
-            (0..8).map(move |k| {
-                let (azimuth, elevation) = (f64::from(k) * std::f64::consts::FRAC_PI_4, elevation.to_radians());
-                let horizontal = elevation.cos();
-                look_at_origin(radius * DVec3::new(horizontal * azimuth.cos(), horizontal * azimuth.sin(), elevation.sin()))
-            })
-        })
-        .collect()
+    rings(radius, &[45.0, 0.0, -45.0], 8)
+}
+
+/// Starts `around84`: 12 azimuths × elevations from 85° to −85° at `radius`, looking at the origin. Near the poles the azimuths are
+/// rolls. No view without roll is farther than 21° from one of them.
+pub fn around84(radius: f64) -> Vec<DMat4> {
+    rings(radius, &[85.0, 60.0, 30.0, 0.0, -30.0, -60.0, -85.0], 12)
 }
 
 /// Starts `neighbor4` (spec 4): the rough pose turned about the world origin by 30°, down and up about its own x axis, right and
@@ -107,6 +116,13 @@ pub fn to_rows(matrix: &DMat4) -> [f64; 12] {
         }
     }
     rows
+}
+
+/// The rigid motion nearest to a row-major 3×4 matrix that rounding has left nearly rigid.
+pub fn from_rows(rows: &[f32]) -> DMat4 {
+    let column = |k: usize| DVec3::new(rows[k].into(), rows[4 + k].into(), rows[8 + k].into());
+    let rotation = DQuat::from_mat3(&DMat3::from_cols(column(0), column(1), column(2))).normalize();
+    DMat4::from_rotation_translation(rotation, column(3))
 }
 
 #[cfg(test)]
@@ -141,6 +157,22 @@ mod tests {
             let origin = matrix.inverse().transform_point3(DVec3::ZERO);
             assert!(origin.x.abs() < 1e-9 && origin.y.abs() < 1e-9 && origin.z > 0.0, "the origin is on the optical axis");
         }
+    }
+
+    #[test]
+    fn no_upright_view_is_far_from_a_start() {
+        let starts = around84(1.3);
+        let farthest = (0..2000).map(|k| {
+            // Evenly over the sphere, by the golden angle.
+            let z = 1.0 - (f64::from(k) + 0.5) / 1000.0;
+            let (y, x) = (2.399963 * f64::from(k)).sin_cos();
+            let r = (1.0 - z * z).sqrt();
+            let view = look_at_origin(1.3 * DVec3::new(r * x, r * y, z));
+            starts.iter().map(|start| pose_error(start, &view).0).fold(f64::INFINITY, f64::min)
+        });
+        let farthest = farthest.fold(0.0, f64::max);
+        println!("{farthest:.1}°");
+        assert!(farthest < 22.0, "{farthest}°");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use glam::DMat4;
 use serde::Serialize;
 
 use crate::camera::{Intrinsics, Pose6};
-use crate::descent::{Descent, Loss, Shape};
+use crate::descent::{Descent, Loss, Method, Shape};
 use crate::engine::Engine;
 use crate::model::Model;
 use crate::random::{initial_depths, stream};
@@ -28,14 +28,12 @@ pub struct Query {
 }
 
 /// Some steps with the same settings.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Phase {
-    /// Steps of Adam.
+    /// Steps; none: the poses are only compared with the image.
     pub steps: u32,
     /// Every how many pixels, in both directions, a ray is cast.
     pub stride: u32,
-    /// Learning rate of the first step and of the last; between them it falls along half a cosine.
-    pub learning_rate: (f64, f64),
     /// How many hypotheses of each image enter this phase: those with the lowest loss.
     pub keep: usize,
 }
@@ -43,44 +41,33 @@ pub struct Phase {
 /// How poses are estimated.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
-    /// How render and image are compared.
-    pub loss: Loss,
+    /// How hypotheses move.
+    pub method: Method,
     /// Phases, one after the other.
     pub phases: Vec<Phase>,
-    /// What the steps change.
-    pub frame: Frame,
-    /// True: a hypothesis ends at the best step of its last phase; false: at its last step, as in the paper.
-    pub keep_best: bool,
     /// Seed of the initial depths.
     pub seed: u64,
 }
 
-/// What the steps of a descent change.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Frame {
-    /// The camera's own six numbers, as in the paper: to orbit the object, angles and centre must change together.
-    Camera,
-    /// The six numbers of a motion about the object: [`Descent::set_starts`].
-    Object,
+impl Default for Options {
+    /// Levenberg–Marquardt: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the
+    /// best one on all.
+    fn default() -> Self {
+        let phases = vec![
+            Phase { steps: 0, stride: 4, keep: usize::MAX },
+            Phase { steps: 8, stride: 4, keep: 16 },
+            Phase { steps: 8, stride: 2, keep: 4 },
+            Phase { steps: 8, stride: 1, keep: 1 },
+        ];
+        Options { method: Method::LevenbergMarquardt { soft: 0.3 }, phases, seed: 0 }
+    }
 }
 
 impl Options {
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
     pub fn paper() -> Self {
-        let phase = Phase { steps: 300, stride: 1, learning_rate: (0.1, 0.1), keep: usize::MAX };
-        Options { loss: Loss::Mae, phases: vec![phase], frame: Frame::Camera, keep_best: false, seed: 0 }
-    }
-
-    /// Steps about the object; all starts on few rays, the six most promising ones on more, the best
-    /// one to the end on all.
-    pub fn culled() -> Self {
-        let phases = vec![
-            Phase { steps: 30, stride: 4, learning_rate: (0.05, 0.05), keep: usize::MAX },
-            Phase { steps: 40, stride: 3, learning_rate: (0.05, 0.03), keep: 6 },
-            Phase { steps: 40, stride: 2, learning_rate: (0.03, 0.005), keep: 2 },
-            Phase { steps: 40, stride: 1, learning_rate: (0.01, 0.0005), keep: 1 },
-        ];
-        Options { loss: Loss::Mae, phases, frame: Frame::Object, keep_best: true, seed: 0 }
+        let method = Method::Adam { loss: Loss::Mae, learning_rate: 0.1 };
+        Options { method, phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX }], seed: 0 }
     }
 
     /// The same with `steps` steps in all, shared between the phases in their present proportions.
@@ -92,15 +79,6 @@ impl Options {
             let until = (2 * before * u64::from(steps) + total) / (2 * total);
             phase.steps = until as u32 - done;
             done = until as u32;
-        }
-        self
-    }
-
-    /// The same with all learning rates scaled, so that the first one is `first`.
-    pub fn with_learning_rate(mut self, first: f64) -> Self {
-        let scale = self.phases.first().map_or(1.0, |phase| first / phase.learning_rate.0);
-        for phase in &mut self.phases {
-            phase.learning_rate = (scale * phase.learning_rate.0, scale * phase.learning_rate.1);
         }
         self
     }
@@ -209,23 +187,22 @@ pub fn estimate(
         let names: Vec<(usize, usize)> = running.iter().map(|h| (h.query, h.start)).collect();
         let mut descent = prepare(engine, model, queries, options, phase, &running)?;
         let rows = running.len() * rays_of(&queries[0], phase.stride).count();
-        for k in 0..phase.steps {
-            let mut random = stream(options.seed, 1 + u64::from(step));
-            descent.set_initial_depths(&initial_depths(&mut random, rows))?;
+        for _ in 0..phase.steps {
+            // New depths in every step, as in the paper; but whether Levenberg–Marquardt keeps a step must not depend on luck.
+            if matches!(options.method, Method::Adam { .. }) {
+                let mut random = stream(options.seed, 1 + u64::from(step));
+                descent.set_initial_depths(&initial_depths(&mut random, rows))?;
+            }
             descent.evaluate()?;
             observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
-            descent.descend(learning_rate(phase, k))?;
+            descent.descend()?;
             step += 1;
         }
         descent.evaluate()?;
         observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
-        let last: Vec<(f64, Pose6)> = descent.losses()?.into_iter().zip(descent.poses()?).collect();
-        let best = descent.best()?;
-        for ((hypothesis, last), best) in running.iter_mut().zip(last).zip(best) {
-            let is_last = number + 1 == options.phases.len();
-            let take_best = options.keep_best && is_last && (best.0 <= last.0 || !last.0.is_finite());
-            (hypothesis.loss, hypothesis.pose) = if take_best { best } else { last };
-            // A NaN must not win; the largest f32 is what `best` holds where every loss was one.
+        for (hypothesis, standing) in running.iter_mut().zip(descent.standing()?) {
+            (hypothesis.loss, hypothesis.pose) = standing;
+            // A NaN must not win; the largest f32 is what a descent holds that never had another.
             if hypothesis.loss.is_nan() || hypothesis.loss >= f32::MAX.into() {
                 hypothesis.loss = f64::INFINITY;
             }
@@ -248,13 +225,6 @@ pub fn estimate(
 
 fn rays_of(query: &Query, stride: u32) -> impl Iterator<Item = (u32, u32)> {
     pixel_grid(query.width, query.height, stride)
-}
-
-/// From `learning_rate.0` at the first step to `.1` at the last, along half a cosine.
-fn learning_rate(phase: &Phase, step: u32) -> f64 {
-    let (first, last) = phase.learning_rate;
-    let progress = f64::from(step) / f64::from(phase.steps.saturating_sub(1).max(1));
-    last + (first - last) * 0.5 * (1.0 + (std::f64::consts::PI * progress).cos())
 }
 
 fn prepare(
@@ -286,13 +256,10 @@ fn prepare(
         height: across(queries[0].height),
         instances: instances.len() as u32,
     };
-    let mut descent = Descent::new(engine, model, shape, options.loss)?;
+    let mut descent = Descent::new(engine, model, shape, options.method)?;
     descent.set_targets(&instances, &slots, &rays, &target)?;
     let poses: Vec<Pose6> = running.iter().map(|h| h.pose).collect();
-    match options.frame {
-        Frame::Camera => descent.set_poses(&poses)?,
-        Frame::Object => descent.set_starts(&poses)?,
-    }
+    descent.set_poses(&poses)?;
     Ok(descent)
 }
 
@@ -308,7 +275,7 @@ fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Erro
         if phase.stride == 0 || phase.keep == 0 {
             return setting("phases", "stride and keep must be at least 1");
         }
-        if options.loss == Loss::Gmsd && phase.stride != 1 {
+        if matches!(options.method, Method::Adam { loss: Loss::Gmsd, .. }) && phase.stride != 1 {
             return setting("loss", "GMSD compares neighbouring pixels: it needs stride 1 in every phase");
         }
     }
@@ -342,21 +309,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn steps_and_learning_rates_keep_their_proportions() {
+    fn steps_keep_their_proportions() {
+        let default = Options::default();
         for steps in [0, 1, 7, 250, 1000] {
-            let options = Options::culled().with_steps(steps);
+            let options = default.clone().with_steps(steps);
             assert_eq!(options.phases.iter().map(|phase| phase.steps).sum::<u32>(), steps);
         }
-        let culled = Options::culled();
-        let total = culled.phases.iter().map(|phase| phase.steps).sum();
-        assert_eq!(culled.clone().with_steps(total), culled);
-        let faster = culled.clone().with_learning_rate(2.0 * culled.phases[0].learning_rate.0);
-        for (phase, before) in faster.phases.iter().zip(&culled.phases) {
-            assert!((phase.learning_rate.1 - 2.0 * before.learning_rate.1).abs() < 1e-15);
-        }
+        let total = default.phases.iter().map(|phase| phase.steps).sum();
+        assert_eq!(default.clone().with_steps(total), default);
         let keeps = |options: &Options| options.phases.iter().map(|phase| (phase.steps, phase.keep)).collect::<Vec<_>>();
         assert_eq!(keeps(&Options::paper().with_culling()), [(60, usize::MAX), (240, 6)]);
-        assert_eq!(culled.clone().with_culling(), culled);
-        assert!(culled.with_stride(1).without_culling().phases.iter().all(|phase| (phase.stride, phase.keep) == (1, usize::MAX)));
+        assert_eq!(default.clone().with_culling(), default);
+        assert!(
+            default.with_stride(1).without_culling().phases.iter().all(|phase| (phase.stride, phase.keep) == (1, usize::MAX))
+        );
     }
 }

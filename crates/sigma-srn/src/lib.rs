@@ -19,10 +19,10 @@ mod renderer;
 mod trainer;
 
 pub use camera::{Intrinsics, Pose6};
-pub use descent::{Descent, Loss, Shape};
+pub use descent::{Descent, Loss, Method, Shape};
 pub use engine::Engine;
 pub use error::Error;
-pub use estimator::{Estimate, Frame, Options, Phase, Progress, Query, Ranked, estimate};
+pub use estimator::{Estimate, Options, Phase, Progress, Query, Ranked, estimate};
 pub use model::{Block, Kind, Layout, Metadata, Model, ModelConfig, Parameter, write_atomically};
 pub use random::{Random, stream};
 pub use rays::{Rays, pixel_grid};

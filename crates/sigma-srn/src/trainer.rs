@@ -250,6 +250,7 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
     let partial = b.scratch("partial sums", partial_len.max(sums))?;
     let target = b.input("target rgb", 3 * rows as usize)?;
     let tile_target = b.scratch("tile target", 3 * most as usize)?;
+    let d_rgb = b.scratch("tile d rgb", 3 * most as usize)?;
     let count = b.input("target count", images as usize)?;
     let (loss_images, loss_latent, loss_depth) =
         (b.scratch("image loss", images as usize)?, b.scratch("latent loss", 1)?, b.scratch("depth loss", 1)?);
@@ -261,10 +262,10 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
         forward::render(b, &network, &saved, tile)?;
         tile_ops::gather(b, tile, 3, target, tile_target)?;
         let scale = (IMAGE_WEIGHT / f64::from(images)) as f32;
-        image_loss::backward(b, image_loss::Kind::Mse, tile.rows, rays, scale, saved.rgb(), tile_target, count, scratch.d_rgb)?;
+        image_loss::backward(b, image_loss::Kind::Mse, tile.rows, rays, scale, saved.rgb(), tile_target, count, d_rgb)?;
         let scale = (DEPTH_WEIGHT / f64::from(rows)) as f32;
         depth::backward(b, tile.rows, scale, network.world_from_camera, saved.depth, scratch.d_origin)?;
-        backward::render(b, &network, &saved, &scratch, partial, tile, true, &mut started)?;
+        backward::render(b, &network, &saved, &scratch, partial, tile, d_rgb, true, &mut started)?;
     }
     backward::hypernetwork(b, &network, &hyper_saved, &hyper_scratch, partial, &mut started)?;
     let scale = (LATENT_WEIGHT / f64::from(codes_count)) as f32;

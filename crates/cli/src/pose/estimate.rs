@@ -27,9 +27,9 @@ pub struct Estimate {
     instance: Option<String>,
     #[command(flatten)]
     camera: CameraArgs,
-    /// Where to start: `fixed24`, all around; `neighbor4`, 30° to four sides of --rough; or a file with 16 numbers per line, a
-    /// `world_from_camera` each. Default: `neighbor4` with --rough, else `fixed24`.
-    #[arg(long, value_name = "fixed24|neighbor4|FILE")]
+    /// Where to start: `around84`, all around; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file
+    /// with 16 numbers per line, a `world_from_camera` each. Default: `neighbor4` with --rough, else `around84`.
+    #[arg(long, value_name = "around84|fixed24|neighbor4|FILE")]
     starts: Option<Starts>,
     /// Roughly known pose: a pose file, or `auto`, the one in the picture's SRN folder. Once, or once per picture.
     #[arg(long, value_name = "POSE")]
@@ -99,7 +99,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let side = model_side(&model, &args.images[0])?;
     let rough = poses("--rough", &args.rough, &args.images)?;
     let pictures = pictures(args, &model, side)?;
-    let default = if args.rough.is_empty() { Starts::Fixed24 } else { Starts::Neighbor4 };
+    let default = if args.rough.is_empty() { Starts::Around84 } else { Starts::Neighbor4 };
     let starts = args.starts.as_ref().unwrap_or(&default);
     let starts = rough.iter().map(|rough| args.search.starts(starts, &model, rough.as_ref())).collect::<Result<Vec<_>>>()?;
     if let Some(dir) = &args.record {
@@ -108,9 +108,9 @@ pub fn run(args: &Estimate) -> Result<bool> {
         refuse_existing(files, args.force)?;
         create_dir(dir)?;
     }
+    let options = args.search.options()?;
     let engine = args.engine.open()?;
 
-    let options = args.search.options();
     let bar = progress(options.phases.iter().map(|phase| u64::from(phase.steps)).sum(), "steps");
     let mut log = Log::default();
     let found = args.search.run(&engine, &model, side, &pictures, &starts, |mut progress| {

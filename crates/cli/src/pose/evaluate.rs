@@ -27,9 +27,9 @@ pub struct Evaluate {
     /// Data set in the SRN folder layout, of views that the model has not seen; instances are matched by name.
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
-    /// Where to start: `neighbor4`, the true pose turned by 30° to four sides; `fixed24`, all around; or a file with 16 numbers
-    /// per line, a `world_from_camera` each.
-    #[arg(long, value_name = "neighbor4|fixed24|FILE", default_value = "neighbor4")]
+    /// Where to start: `neighbor4`, the true pose turned by 30° to four sides; `around84`, all around; `fixed24`, the paper's fewer;
+    /// or a file with 16 numbers per line, a `world_from_camera` each.
+    #[arg(long, value_name = "neighbor4|around84|fixed24|FILE", default_value = "neighbor4")]
     starts: Starts,
     /// Views of each instance, evenly spread over those that there are.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
@@ -143,9 +143,9 @@ pub fn run(args: &Evaluate) -> Result<bool> {
         refuse_existing(files.map(|file| dir.join(file)), args.force)?;
         create_dir(dir)?;
     }
+    let options = args.search.options()?;
     let engine = args.engine.open()?;
 
-    let options = args.search.options();
     let steps: u64 = options.phases.iter().map(|phase| u64::from(phase.steps)).sum();
     let bar = progress(steps * instances.len() as u64, "steps");
     let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();

@@ -44,7 +44,7 @@ struct Point {
 impl Log {
     /// Notes where all hypotheses are.
     pub fn note(&mut self, progress: &mut Progress) -> std::result::Result<(), Error> {
-        let (losses, poses) = (progress.descent.losses()?, progress.descent.poses()?);
+        let (losses, poses) = progress.descent.standing()?.into_iter().unzip();
         self.0.push(Moment { step: progress.step, hypotheses: progress.hypotheses.to_vec(), losses, poses });
         Ok(())
     }

@@ -7,8 +7,10 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::camera::{fixed24, neighbor4, pose_error};
-use sigma_srn::{Engine, Error, Estimate, Intrinsics, Loss, Model, Options, Progress, Query, Renderer, Rendering, estimate};
+use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
+use sigma_srn::{
+    Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer, Rendering, estimate,
+};
 
 use super::files::Picture;
 use super::positive;
@@ -21,17 +23,17 @@ const RENDER_BATCH: usize = 8;
 #[derive(Args, Clone, Debug)]
 #[command(next_help_heading = "Search")]
 pub struct SearchArgs {
-    /// `default`: all starts on few rays, then only the most promising on more; each ends at its best step. `paper`: 300 steps
-    /// of Adam at 0.1 for every start, on all pixels; the last step counts.
+    /// `default`: Levenberg–Marquardt about the object, all starts on few rays, then only the most promising on more. `paper`: 300
+    /// steps of Adam on the camera's six numbers for every start, on all pixels; the last step counts.
     #[arg(long, value_enum, default_value_t = Preset::Default)]
     preset: Preset,
-    /// How picture and render are compared. `gmsd` implies `--stride 1`.
-    #[arg(long, default_value = "mae", value_parser = PossibleValuesParser::new(LOSSES.map(|(name, _)| name)).map(loss))]
-    loss: Loss,
+    /// How `--preset paper` compares picture and render. Default: mae. `gmsd` implies `--stride 1`.
+    #[arg(long, value_parser = PossibleValuesParser::new(LOSSES.map(|(name, _)| name)).map(loss))]
+    loss: Option<Loss>,
     /// Steps in all; the phases of the preset keep their shares.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     steps: Option<u32>,
-    /// Learning rate of the first step; the later ones keep their proportion to it.
+    /// Learning rate of `--preset paper`. Default: 0.1.
     #[arg(long, value_name = "X", value_parser = positive)]
     lr: Option<f64>,
     /// Drop the less promising starts on the way: what the default preset does; the paper's goes on with 6 after a fifth.
@@ -52,7 +54,7 @@ pub struct SearchArgs {
     // the wrong object left 0.32 to 0.60.
     #[arg(long, value_name = "X", default_value_t = 0.25, value_parser = positive)]
     accept: f64,
-    /// Distance of the starts of `fixed24` from the object's centre, in object units. Default: as the model was trained.
+    /// Distance of the starts of `around84` and `fixed24` from the object's centre, in object units. Default: as the model was trained.
     #[arg(long, value_name = "R", value_parser = positive)]
     radius: Option<f64>,
 }
@@ -73,7 +75,9 @@ fn loss(name: String) -> Loss {
 /// Where searches start.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Starts {
-    /// 8 azimuths × 3 elevations around the object.
+    /// 12 azimuths × 7 elevations around the object.
+    Around84,
+    /// 8 azimuths × 3 elevations around the object, the paper's.
     Fixed24,
     /// A rough pose, turned by 30° to four sides.
     Neighbor4,
@@ -84,6 +88,7 @@ pub enum Starts {
 impl From<&str> for Starts {
     fn from(text: &str) -> Self {
         match text {
+            "around84" => Starts::Around84,
             "fixed24" => Starts::Fixed24,
             "neighbor4" => Starts::Neighbor4,
             path => Starts::File(path.into()),
@@ -93,11 +98,19 @@ impl From<&str> for Starts {
 
 impl SearchArgs {
     /// The settings of the estimator.
-    pub fn options(&self) -> Options {
+    pub fn options(&self) -> Result<Options> {
         let mut options = match self.preset {
-            Preset::Default => Options::culled(),
+            Preset::Default => Options::default(),
             Preset::Paper => Options::paper(),
         };
+        match (&mut options.method, self.loss, self.lr) {
+            (Method::Adam { loss, learning_rate }, wanted_loss, wanted_rate) => {
+                *loss = wanted_loss.unwrap_or(*loss);
+                *learning_rate = wanted_rate.unwrap_or(*learning_rate);
+            }
+            (_, None, None) => {}
+            _ => return Err("--loss and --lr are for --preset paper: the default has one loss and no learning rate".into()),
+        }
         if self.no_cull {
             options = options.without_culling();
         } else if self.cull {
@@ -106,13 +119,10 @@ impl SearchArgs {
         if let Some(steps) = self.steps {
             options = options.with_steps(steps);
         }
-        if let Some(rate) = self.lr {
-            options = options.with_learning_rate(rate);
-        }
-        if let Some(stride) = self.stride.or((self.loss == Loss::Gmsd).then_some(1)) {
+        if let Some(stride) = self.stride.or((self.loss == Some(Loss::Gmsd)).then_some(1)) {
             options = options.with_stride(stride);
         }
-        Options { loss: self.loss, seed: self.seed, ..options }
+        Ok(Options { seed: self.seed, ..options })
     }
 
     /// Estimates the poses of `pictures`, all of `side` pixels, each from its own starts.
@@ -135,7 +145,7 @@ impl SearchArgs {
         };
         let queries: Vec<_> = pictures.iter().zip(starts).map(query).collect();
         let began = Instant::now();
-        let estimates = estimate(engine, model, &queries, &self.options(), observe)?;
+        let estimates = estimate(engine, model, &queries, &self.options()?, observe)?;
         let seconds = began.elapsed().as_secs_f64() / pictures.len() as f64;
 
         let view = |(picture, found): (&Picture, &Estimate)| (picture.instance, found.pose.to_matrix(), picture.intrinsics);
@@ -149,16 +159,19 @@ impl SearchArgs {
         Ok(found.collect())
     }
 
+    fn radius(&self, model: &Model) -> Result<f64> {
+        let radius = self.radius.or(model.metadata.orbit_radius);
+        Ok(radius.ok_or("the model does not say how far its cameras were: give --radius")?)
+    }
+
     /// The poses to start from; `rough` is the one that `neighbor4` turns.
     pub fn starts(&self, starts: &Starts, model: &Model, rough: Option<&DMat4>) -> Result<Vec<DMat4>> {
         match starts {
-            Starts::Fixed24 => {
-                let radius = self.radius.or(model.metadata.orbit_radius);
-                Ok(fixed24(radius.ok_or("the model does not say how far its cameras were: give --radius")?))
-            }
+            Starts::Around84 => Ok(around84(self.radius(model)?)),
+            Starts::Fixed24 => Ok(fixed24(self.radius(model)?)),
             Starts::Neighbor4 => Ok(neighbor4(rough.ok_or("--starts neighbor4 turns a rough pose: give --rough")?)),
             Starts::File(path) if !path.exists() => {
-                Err(format!("--starts {}: no such file; expected fixed24, neighbor4 or a file", path.display()).into())
+                Err(format!("--starts {}: no such file; expected around84, fixed24, neighbor4 or a file", path.display()).into())
             }
             Starts::File(path) => Ok(srn_data::srn::read_poses(path)?),
         }

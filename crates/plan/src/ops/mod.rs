@@ -5,16 +5,15 @@
 
 pub mod adam;
 pub mod advance;
-pub mod compose;
 pub mod density_sum;
 pub mod depth;
 pub mod depth_loss;
 pub mod embedding;
 pub mod gmsd;
 pub mod image_loss;
-pub mod keep_best;
 pub mod latent_loss;
 pub mod layer_norm_relu;
+pub mod levenberg_marquardt;
 pub mod linear;
 pub mod lstm_cell;
 pub mod pack_rgba8;

@@ -38,7 +38,7 @@ struct Inside {
     partial: BufferId,
 }
 
-/// From `d_rgb` of the tile (in `scratch.d_rgb`) to `scratch.d_origin` and `scratch.d_direction` of its rays, and to the weights
+/// From `d_rgb` of the tile's rows, which is left as it is, to `scratch.d_origin` and `scratch.d_direction` of its rays, and to the weights
 /// that have gradients. `d_end`: whether `scratch.d_origin` already holds a gradient of the end points (the depth term).
 pub(crate) fn render(
     b: &mut Builder,
@@ -47,6 +47,7 @@ pub(crate) fn render(
     scratch: &Scratch,
     partial: BufferId,
     tile: Tile,
+    d_rgb: BufferId,
     d_end: bool,
     started: &mut Started,
 ) -> Result<(), PlanError> {
@@ -64,18 +65,7 @@ pub(crate) fn render(
     }
 
     let d_phi = Into { buffer: scratch.d_phi, accumulate: false };
-    mlp(
-        b,
-        network,
-        rows,
-        &network.pixel_generator,
-        saved.phi,
-        &saved.pixel_generator,
-        scratch.d_rgb,
-        inside,
-        Some(d_phi),
-        started,
-    )?;
+    mlp(b, network, rows, &network.pixel_generator, saved.phi, &saved.pixel_generator, d_rgb, inside, Some(d_phi), started)?;
 
     for i in (0..=last).rev() {
         let v = saved.scene[i].last().expect("f has layers").y;

@@ -139,7 +139,6 @@ impl Saved {
 /// Scratch of the backward pass.
 #[derive(Debug)]
 pub(crate) struct Scratch {
-    pub d_rgb: BufferId,
     pub d_phi: BufferId,
     /// Gradients inside an MLP: towards `y`, towards `z`, and towards `y` of the density net.
     pub d_y: BufferId,
@@ -178,7 +177,6 @@ impl Scratch {
         let d_c = [even, if network.tracing_steps > 1 { scratch("d c odd", lstm)? } else { even }];
         let (d_phi, d_y) = (scratch("d phi", f_and_h)?, scratch("d y", f_and_h)?);
         Ok(Scratch {
-            d_rgb: scratch("tile d rgb", 3)?,
             d_phi,
             d_y,
             d_z: scratch("d z", f_and_h.max(widest(density)))?,

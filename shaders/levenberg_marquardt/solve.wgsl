@@ -1,0 +1,103 @@
+// (A + damping diag A) ξ = -g, times max(1, √(0.01 / damping)), |ξ| ≤ 0.2; (ω, υ) = ξ, E = exp(ω): R' = R E, t' = R (E Rᵀt + υ).
+// One invocation solves for one pose, by Cholesky's factors.
+// equations [B, 28] = (upper triangle of A, g, loss), pose [B, 12], damping [B] → world_from_camera [B, 12].
+// OVERWRITES world_from_camera; it is the old pose where A is not positive.
+
+// ξ turns and shifts the camera about the world's origin, in the camera's axes. It is stretched while steps are being kept: where the
+// derivatives of neighbouring rays disagree, the step of least squares is far shorter than the way to the minimum.
+
+struct Params {
+    poses: u32,
+}
+
+@group(0) @binding(0) var<uniform> params: Params;
+@group(0) @binding(1) var<storage, read> equations: array<f32>;
+@group(0) @binding(2) var<storage, read> pose: array<f32>;
+@group(0) @binding(3) var<storage, read> damping: array<f32>;
+@group(0) @binding(4) var<storage, read_write> world_from_camera: array<f32>;
+
+// Row a of the upper triangle begins at 6a - a(a-1)/2; entry (a, b), a ≤ b.
+fn entry(a: u32, b: u32) -> u32 {
+    return a * (11u - a) / 2u + b;
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_id) local: vec3<u32>,
+) {
+    let number = flat_index(workgroup, workgroups, local);
+    if (number >= params.poses) {
+        return;
+    }
+    let at = 28u * number;
+    // Rows of the lower factor L, then L y = -g, then Lᵀ ξ = y.
+    var lower: array<array<f32, 6>, 6>;
+    var xi: array<f32, 6>;
+    var solvable = true;
+    for (var i = 0u; i < 6u; i++) {
+        var y = -equations[at + 21u + i];
+        for (var j = 0u; j <= i; j++) {
+            var sum = equations[at + entry(j, i)];
+            if (i == j) {
+                sum *= 1.0 + damping[number];
+            }
+            for (var k = 0u; k < j; k++) {
+                sum -= lower[i][k] * lower[j][k];
+            }
+            if (i == j) {
+                solvable = solvable && sum > 0.0;
+                lower[i][i] = sqrt(abs(sum));
+            } else {
+                lower[i][j] = sum / lower[j][j];
+                y -= lower[i][j] * xi[j];
+            }
+        }
+        xi[i] = y / lower[i][i];
+    }
+    var squares = 0.0;
+    for (var back = 0u; back < 6u; back++) {
+        let i = 5u - back;
+        for (var k = i + 1u; k < 6u; k++) {
+            xi[i] -= lower[k][i] * xi[k];
+        }
+        xi[i] /= lower[i][i];
+        squares += xi[i] * xi[i];
+    }
+    // Not finite where a factor is zero.
+    let size = sqrt(squares);
+    let usable = solvable && size > 0.0 && size < 1e30;
+    let factor = min(max(1.0, sqrt(0.01 / damping[number])), 0.2 / size);
+    let turn = select(vec3(0.0), factor * vec3(xi[0], xi[1], xi[2]), usable);
+    let shift = select(vec3(0.0), factor * vec3(xi[3], xi[4], xi[5]), usable);
+
+    let w = 12u * number;
+    let r = mat3x3(
+        pose[w], pose[w + 4u], pose[w + 8u],
+        pose[w + 1u], pose[w + 5u], pose[w + 9u],
+        pose[w + 2u], pose[w + 6u], pose[w + 10u],
+    );
+    let centre = vec3(pose[w + 3u], pose[w + 7u], pose[w + 11u]) * r;
+    // Rodrigues: exp(ω) v = v + sin|ω|/|ω| ω×v + (1 - cos|ω|)/|ω|² ω×(ω×v), the factors by half angles and series.
+    let angle2 = dot(turn, turn);
+    let angle = sqrt(angle2);
+    let half = 0.5 * angle;
+    let half_sinc = select(sin(half) / half, 1.0 - half * half / 6.0, half < 1e-2);
+    let a = half_sinc * cos(half);
+    let b = 0.5 * half_sinc * half_sinc;
+    let e0 = rotated(vec3(1.0, 0.0, 0.0), turn, a, b);
+    let e1 = rotated(vec3(0.0, 1.0, 0.0), turn, a, b);
+    let e2 = rotated(vec3(0.0, 0.0, 1.0), turn, a, b);
+    let columns = array(r * e0, r * e1, r * e2, r * (rotated(centre, turn, a, b) + shift));
+    for (var row = 0u; row < 3u; row++) {
+        for (var column = 0u; column < 4u; column++) {
+            world_from_camera[w + 4u * row + column] = columns[column][row];
+        }
+    }
+}
+
+fn rotated(v: vec3<f32>, turn: vec3<f32>, a: f32, b: f32) -> vec3<f32> {
+    let once = cross(turn, v);
+    return v + a * once + b * cross(turn, once);
+}
