@@ -8,7 +8,7 @@ use serde::Deserialize;
 use srn_data::camera::Axes;
 use srn_data::capture::{Bounds, Capture, FrameRecord, UpAxis};
 use srn_data::formats::{self, Format, ReadOptions, WriteOptions, Written, bop};
-use srn_data::inspect;
+use srn_data::inspect::{self, Origin};
 
 use crate::common::{Result, progress};
 
@@ -371,10 +371,11 @@ impl Inspect {
     pub fn run(&self) -> Result<bool> {
         refuse_existing(self.out.iter().cloned(), self.force)?;
         let (format, mut captures) = self.source.read()?;
-        if format != Format::Srn {
+        let origin = if format == Format::Srn { Origin::Given } else { Origin::Found };
+        if origin == Origin::Found {
             inspect::place_all(&mut captures, 1.3)?;
         }
-        let report = inspect::inspect(&captures, self.source.convention.unwrap_or(format.axes()));
+        let report = inspect::inspect(&captures, self.source.convention.unwrap_or(format.axes()), origin);
         if self.json {
             println!("{}", serde_json::to_string_pretty(&report)?);
         } else {

@@ -2,7 +2,7 @@
 
 use crate::camera::Camera;
 use crate::error::{Error, Result};
-use crate::picture::Picture;
+use crate::picture::{Picture, middle};
 use glam::{DMat3, DMat4, DVec3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -81,18 +81,15 @@ impl Capture {
         for frame in &self.frames {
             let mut picture = Picture::open(&frame.image, frame.mask.as_deref())?;
             picture.guess_background();
-            silhouettes.push(if picture.is_masked() { picture.contour(&frame.camera) } else { vec![] });
+            let points = if picture.is_masked() { picture.contour(&frame.camera) } else { vec![] };
+            // A few hundred points are as good, and all pairs of them are compared.
+            silhouettes.push(points.iter().copied().step_by(points.len().div_ceil(500).max(1)).collect::<Vec<_>>());
         }
         let known = silhouettes.iter().any(|points| !points.is_empty());
-        let middle = |points: &[glam::DVec2]| {
-            let low = points.iter().copied().fold(glam::DVec2::MAX, glam::DVec2::min);
-            let high = points.iter().copied().fold(glam::DVec2::MIN, glam::DVec2::max);
-            0.5 * (low + high)
-        };
         let rays: Vec<_> = (self.frames.iter().zip(&silhouettes))
             .filter(|(_, points)| !known || !points.is_empty())
             .map(|(frame, points)| {
-                let axis = if known { middle(points) } else { glam::DVec2::ZERO };
+                let axis = middle(points).unwrap_or_default();
                 let pose = frame.camera.world_from_camera;
                 (pose.w_axis.truncate(), pose.transform_vector3(axis.extend(1.0)))
             })

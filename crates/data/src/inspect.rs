@@ -1,9 +1,9 @@
 //! What a source of posed pictures holds and what is probably wrong with it.
 
 use crate::camera::Axes;
-use crate::capture::{Capture, Frame};
+use crate::capture::{Capture, Frame, nearest_point};
 use crate::error::Result;
-use crate::picture::Picture;
+use crate::picture::{Picture, middle};
 use crate::sheet::{self, Colour};
 use glam::{DMat4, DVec2, DVec3};
 use image::RgbImage;
@@ -63,9 +63,17 @@ struct Seen<'a> {
     blank: bool,
 }
 
-/// Looks at every picture and camera. The captures are in our frame: the object at the origin, its diagonal 1. `assumed` are
-/// the axes that their poses were read with.
-pub fn inspect(captures: &[Capture], assumed: Axes) -> Report {
+/// How captures came into our frame, with the object at the origin and its diagonal 1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin {
+    /// They say so themselves: SRN folders.
+    Given,
+    /// [`place_all`] found the object where the cameras look.
+    Found,
+}
+
+/// Looks at every picture and camera of captures in our frame. `assumed` are the axes that their poses were read with.
+pub fn inspect(captures: &[Capture], assumed: Axes, origin: Origin) -> Report {
     let mut report = Report { instances: vec![], problems: vec![], notes: vec![] };
     let mut shared: Option<(&str, [f64; 4])> = None;
     for capture in captures {
@@ -87,21 +95,29 @@ pub fn inspect(captures: &[Capture], assumed: Axes) -> Report {
         if intrinsics != expected && seen.iter().all(|view| view.frame.camera.intrinsics == intrinsics) {
             report.notes.push(format!("{}: intrinsics differ from those of {other}", capture.name));
         }
-        report.check(&capture.name, &seen, assumed);
+        report.check(&capture.name, &seen, assumed, origin);
     }
     report
 }
 
-/// Whether the origin lies before a camera and inside its picture, or at most half a picture outside.
-fn sees_origin(frame: &Frame, world_from_camera: &DMat4) -> bool {
+/// Whether a point lies before a camera and inside its picture, or at most half a picture outside.
+fn sees(point: DVec3, frame: &Frame, world_from_camera: &DMat4) -> bool {
     let camera = crate::Camera { world_from_camera: *world_from_camera, ..frame.camera };
-    let (pixel, depth) = camera.project(DVec3::ZERO);
+    let (pixel, depth) = camera.project(point);
     let size = DVec2::from(camera.size.map(|s| s as f64));
     depth > 0.0 && (pixel / size - 0.5).abs().max_element() < 1.0
 }
 
+impl Seen<'_> {
+    /// The direction of the object's middle in the camera, or of the camera's axis where that is not known.
+    fn middle(&self) -> DVec3 {
+        middle(&self.outline).unwrap_or_default().extend(1.0)
+    }
+}
+
 impl Report {
-    fn check(&mut self, name: &str, seen: &[Seen], assumed: Axes) {
+    fn check(&mut self, name: &str, seen: &[Seen], assumed: Axes, origin: Origin) {
+        let sees_origin = |view: &Seen| sees(DVec3::ZERO, view.frame, &view.frame.camera.world_from_camera);
         let n = seen.len();
         let pose = |view: &Seen| view.frame.camera.world_from_camera;
         let distances = || seen.iter().map(|view| pose(view).w_axis.truncate().length());
@@ -109,7 +125,7 @@ impl Report {
             values.fold([f64::MAX, 0.0], |[low, high]: [f64; 2], x| [low.min(x), high.max(x)])
         };
         let radius = range(&mut distances());
-        let facing = seen.iter().filter(|view| sees_origin(view.frame, &pose(view))).count();
+        let facing = seen.iter().filter(|view| sees_origin(view)).count();
         let off_axis_deg = seen.iter().map(|view| crate::camera::off_axis_deg(&pose(view))).fold(0.0, f64::max);
         let mut sizes = BTreeMap::new();
         for [w, h] in seen.iter().map(|view| view.frame.camera.size) {
@@ -149,9 +165,9 @@ impl Report {
             self.problems.push(format!("{name}: {} of {n} cameras stand where the one before stands", same));
         }
         if facing * 10 < n * 8 {
-            self.problems.push(diagnosis(name, seen, assumed, facing));
+            self.problems.push(diagnosis(name, seen, assumed, origin, facing));
         } else {
-            for view in seen.iter().filter(|view| !sees_origin(view.frame, &pose(view))) {
+            for view in seen.iter().filter(|view| !sees_origin(view)) {
                 let angle = crate::camera::off_axis_deg(&pose(view));
                 self.problems.push(format!("{}: looks {angle:.1}° past the origin", view.frame.image.display()));
             }
@@ -205,7 +221,7 @@ impl Report {
 }
 
 /// What is probably wrong where cameras do not see the object: the reading of the poses under which they would.
-fn diagnosis(name: &str, seen: &[Seen], assumed: Axes, facing: usize) -> String {
+fn diagnosis(name: &str, seen: &[Seen], assumed: Axes, origin: Origin, facing: usize) -> String {
     let n = seen.len();
     let depth = |view: &&Seen| view.frame.camera.world_from_camera.inverse().w_axis.z;
     let away = seen.iter().filter(|view| depth(view) <= 0.0).count();
@@ -222,7 +238,15 @@ fn diagnosis(name: &str, seen: &[Seen], assumed: Axes, facing: usize) -> String 
                 axes.to_ours(if inverted { raw.inverse() } else { raw })
             })
             .collect();
-        let facing = seen.iter().zip(&poses).filter(|(view, pose)| sees_origin(view.frame, pose)).count();
+        // Where the object was found under the wrong reading means nothing under another.
+        let lines =
+            || seen.iter().zip(&poses).map(|(view, pose)| (pose.w_axis.truncate(), pose.transform_vector3(view.middle())));
+        let point = match origin {
+            Origin::Given => Some(DVec3::ZERO),
+            Origin::Found => nearest_point(&lines().collect::<Vec<_>>()),
+        };
+        let all = || seen.iter().zip(&poses);
+        let facing = point.map_or(0, |point| all().filter(|(view, pose)| sees(point, view.frame, pose)).count());
         let upright = poses.iter().filter(|pose| pose.y_axis.z <= 0.05).count();
         (facing, upright, axes, inverted)
     });
@@ -359,7 +383,7 @@ mod tests {
 
     fn inspected(dir: &Path) -> (Vec<Capture>, Report) {
         let captures = read(dir, Format::Srn, &ReadOptions::default()).unwrap();
-        let report = inspect(&captures, Axes::OpenCv);
+        let report = inspect(&captures, Axes::OpenCv, Origin::Given);
         (captures, report)
     }
 
@@ -415,7 +439,7 @@ mod tests {
             spoil(&dir.path().join("b").join(file));
             match read(dir.path(), Format::Srn, &ReadOptions::default()) {
                 Ok(captures) => {
-                    let report = inspect(&captures, Axes::OpenCv);
+                    let report = inspect(&captures, Axes::OpenCv, Origin::Given);
                     let found = report.problems.iter().find(|problem| problem.contains(expected));
                     let named = found.is_some_and(|problem| problem.contains("/b") || problem.starts_with("b:"));
                     assert!(named, "{expected}: {:?}", report.problems);
@@ -444,7 +468,7 @@ mod tests {
             assert!(report.problems.iter().any(|p| p.contains(expected)), "{expected}: {:?}", report.problems);
             // What the doctor says helps.
             let options = ReadOptions { axes: Some(axes), inverted, ..ReadOptions::default() };
-            let report = inspect(&read(dir.path(), Format::Srn, &options).unwrap(), axes);
+            let report = inspect(&read(dir.path(), Format::Srn, &options).unwrap(), axes, Origin::Given);
             assert!(report.problems.is_empty(), "{:?}", report.problems);
         }
     }

@@ -3,20 +3,17 @@
 use crate::camera::Camera;
 use crate::error::{At, Error, Result};
 use glam::DVec2;
-use image::RgbImage;
+use image::{RgbImage, Rgba, RgbaImage};
 use std::path::Path;
 
-/// A picture that may know the object from its background.
+/// A picture whose transparency tells the object from its background.
 #[derive(Debug, Clone)]
-pub(crate) struct Picture {
-    /// Width and height in pixels.
-    pub size: [usize; 2],
-    /// Colour and how much of the pixel is the object, all in [0, 1], row-major.
-    pixels: Vec<[f32; 4]>,
-}
+pub(crate) struct Picture(RgbaImage);
 
 /// Colours from here on are white background, where nothing else tells it.
-const WHITE: f32 = 250.0 / 255.0;
+const WHITE: u8 = 250;
+/// What is more opaque than this is the object.
+const OPAQUE: u8 = 127;
 
 impl Picture {
     /// Reads a picture; its transparency and the mask say what is background.
@@ -24,60 +21,60 @@ impl Picture {
         let decode = |path: &Path| -> Result<image::DynamicImage> {
             image::ImageReader::open(path).at(path)?.with_guessed_format().at(path)?.decode().at(path)
         };
-        let picture = decode(path)?.into_rgba32f();
-        let size = [picture.width() as usize, picture.height() as usize];
-        let mut pixels: Vec<_> = picture.pixels().map(|pixel| pixel.0).collect();
+        let mut picture = decode(path)?.into_rgba8();
         if let Some(path) = mask {
             // A mask is white, or opaque, where the object is.
             let mask = decode(path)?.into_luma_alpha8();
-            if [mask.width() as usize, mask.height() as usize] != size {
-                let expected = format!("{}×{}, as its picture", size[0], size[1]);
+            let (width, height) = picture.dimensions();
+            if mask.dimensions() != (width, height) {
+                let expected = format!("{width}×{height}, as its picture");
                 return Err(Error::field(path, "size", expected, format!("{}×{}", mask.width(), mask.height())));
             }
-            for (pixel, mask) in pixels.iter_mut().zip(mask.pixels()) {
-                pixel[3] *= f32::from(mask[0]) / 255.0 * f32::from(mask[1]) / 255.0;
+            for (pixel, mask) in picture.pixels_mut().zip(mask.pixels()) {
+                let product = u32::from(pixel[3]) * u32::from(mask[0]) * u32::from(mask[1]);
+                pixel[3] = ((product + 255 * 255 / 2) / (255 * 255)) as u8;
             }
         }
-        Ok(Self { size, pixels })
+        Ok(Self(picture))
     }
 
     /// A mask as a picture.
-    pub fn from_luma(mask: &image::GrayImage) -> Self {
-        let pixels = mask.pixels().map(|p| [f32::from(p[0]) / 255.0; 3]).map(|[r, g, b]| [r, g, b, 1.0]).collect();
-        Self { size: [mask.width() as usize, mask.height() as usize], pixels }
+    pub fn from_luma(mask: image::GrayImage) -> Self {
+        Self(image::DynamicImage::from(mask).into_rgba8())
     }
 
     /// Takes white for background in a picture that has none yet and whose edge is white.
     pub fn guess_background(&mut self) {
-        let [width, height] = self.size;
-        let white = |pixel: &[f32; 4]| pixel[..3].iter().all(|&c| c >= WHITE);
-        let edge = || {
-            let rows = (0..width).flat_map(|x| [x, (height - 1) * width + x]);
-            rows.chain((0..height).flat_map(|y| [y * width, y * width + width - 1]))
-        };
-        if !self.is_masked() && edge().filter(|&i| white(&self.pixels[i])).count() * 10 >= edge().count() * 8 {
-            self.pixels.iter_mut().filter(|pixel| white(pixel)).for_each(|pixel| pixel[3] = 0.0);
+        let white = |pixel: &Rgba<u8>| pixel.0[..3].iter().all(|&c| c >= WHITE);
+        let [all, bright] = [true, false].map(|all| self.edge().filter(|pixel| all || white(pixel)).count());
+        if !self.is_masked() && 10 * bright >= 8 * all {
+            self.0.pixels_mut().filter(|pixel| white(pixel)).for_each(|pixel| pixel[3] = 0);
         }
+    }
+
+    fn edge(&self) -> impl Iterator<Item = &Rgba<u8>> {
+        let (width, height) = self.0.dimensions();
+        let rows = (0..width).flat_map(move |x| [(x, 0), (x, height - 1)]);
+        rows.chain((0..height).flat_map(move |y| [(0, y), (width - 1, y)])).map(|(x, y)| self.0.get_pixel(x, y))
     }
 
     /// Whether anything is known to be background.
     pub fn is_masked(&self) -> bool {
-        self.pixels.iter().any(|pixel| pixel[3] < 0.5)
+        self.0.pixels().any(|pixel| pixel[3] <= OPAQUE)
     }
 
     /// Whether the object lies at the picture's edge: part of it is probably cut off.
     pub fn touches_edge(&self) -> bool {
-        let [width, height] = self.size;
-        let inside = |x: usize, y: usize| self.pixels[y * width + x][3] >= 0.5;
-        (0..width).any(|x| inside(x, 0) || inside(x, height - 1)) || (0..height).any(|y| inside(0, y) || inside(width - 1, y))
+        self.edge().any(|pixel| pixel[3] > OPAQUE)
     }
 
     /// The first and last pixel of the object in each row, on the camera's image plane at depth 1, the lens undone.
     pub fn contour(&self, camera: &Camera) -> Vec<DVec2> {
-        let ends = self.pixels.chunks_exact(self.size[0].max(1)).enumerate().flat_map(|(y, row)| {
-            let inside = |pixel: &[f32; 4]| pixel[3] >= 0.5;
-            let ends = row.iter().position(inside).zip(row.iter().rposition(inside));
-            ends.into_iter().flat_map(move |(first, last)| [first, last].map(|x| DVec2::new(x as f64, y as f64)))
+        let ends = self.0.rows().enumerate().flat_map(|(y, row)| {
+            let mut inside = row.enumerate().filter(|(_, pixel)| pixel[3] > OPAQUE).map(|(x, _)| x);
+            let first = inside.next();
+            let ends = first.map(|first| [first, inside.next_back().unwrap_or(first)]);
+            ends.into_iter().flatten().map(move |x| DVec2::new(x as f64, y as f64))
         });
         ends.filter_map(|pixel| camera.undistort(camera.plane(pixel))).collect()
     }
@@ -93,40 +90,51 @@ impl Picture {
             for (i, j) in (0..n).flat_map(|j| (0..n).map(move |i| (i, j))) {
                 let plane = to.plane(DVec2::new(f64::from(u) + offset(i), f64::from(v) + offset(j)));
                 let seen = (plane.length() < reach).then(|| self.over_white(from.pixel(from.distort(plane))));
-                let colour = seen.flatten().unwrap_or([1.0; 3]);
+                let colour = seen.flatten().unwrap_or([255.0; 3]);
                 (0..3).for_each(|c| sum[c] += colour[c]);
             }
-            image::Rgb(sum.map(|s| (255.0 * s / (n * n) as f32).round() as u8))
+            image::Rgb(sum.map(|s| (s / (n * n) as f32).round() as u8))
         })
     }
 
-    /// The colour between pixels over white; `None` outside.
+    /// The colour between pixels over white, up to 255; `None` outside.
     fn over_white(&self, at: DVec2) -> Option<[f32; 3]> {
-        let [width, height] = self.size.map(|s| s as f64);
-        if !(at.x >= -0.5 && at.y >= -0.5 && at.x <= width - 0.5 && at.y <= height - 0.5) {
+        let (width, height) = self.0.dimensions();
+        let last = DVec2::new(f64::from(width - 1), f64::from(height - 1));
+        if !(at.cmpge(DVec2::splat(-0.5)) & at.cmple(last + 0.5)).all() {
             return None;
         }
-        let [x, y] = [at.x.clamp(0.0, width - 1.0), at.y.clamp(0.0, height - 1.0)];
-        let [x0, y0] = [x as usize, y as usize];
-        let [x1, y1] = [(x0 + 1).min(self.size[0] - 1), (y0 + 1).min(self.size[1] - 1)];
+        let DVec2 { x, y } = at.clamp(DVec2::ZERO, last);
+        let [x0, y0] = [x as u32, y as u32];
+        let [x1, y1] = [(x0 + 1).min(width - 1), (y0 + 1).min(height - 1)];
         let [fx, fy] = [x.fract() as f32, y.fract() as f32];
         let mut sum = [0.0; 3];
         for (x, y, weight) in
             [(x0, y0, (1.0 - fx) * (1.0 - fy)), (x1, y0, fx * (1.0 - fy)), (x0, y1, (1.0 - fx) * fy), (x1, y1, fx * fy)]
         {
-            let [r, g, b, a] = self.pixels[y * self.size[0] + x];
-            let over = [r, g, b].map(|c| c * a + 1.0 - a);
+            let [r, g, b, a] = self.0.get_pixel(x, y).0.map(f32::from);
+            let over = [r, g, b].map(|c| 255.0 + (c - 255.0) * a / 255.0);
             (0..3).for_each(|c| sum[c] += weight * over[c]);
         }
         Some(sum)
     }
 }
 
+/// The corners of the box around points; `None` without points.
+fn extent(points: &[DVec2]) -> Option<[DVec2; 2]> {
+    let corner = |pick: fn(DVec2, DVec2) -> DVec2| points.iter().copied().reduce(pick);
+    Some([corner(DVec2::min)?, corner(DVec2::max)?])
+}
+
+/// The middle of the box around points; `None` without points.
+pub(crate) fn middle(points: &[DVec2]) -> Option<DVec2> {
+    extent(points).map(|[low, high]| 0.5 * (low + high))
+}
+
 /// The camera of a square cut around points of the image plane: `side` pixels, the points within it but for a margin of this
 /// share of their extent on each side. `None` without points.
 pub(crate) fn cut(camera: &Camera, points: &[DVec2], margin: f64, side: usize) -> Option<Camera> {
-    let low = points.iter().copied().fold(DVec2::MAX, DVec2::min);
-    let high = points.iter().copied().fold(DVec2::MIN, DVec2::max);
+    let [low, high] = extent(points)?;
     let extent = (high - low).max_element() * (1.0 + 2.0 * margin);
     (extent > 0.0 && extent.is_finite()).then(|| {
         let focal = side as f64 / extent;
@@ -142,7 +150,7 @@ pub(crate) fn cut(camera: &Camera, points: &[DVec2], margin: f64, side: usize) -
 mod tests {
     use super::*;
     use glam::{DMat4, DVec3};
-    use image::{Rgb, Rgba, RgbaImage};
+    use image::Rgb;
 
     const CAMERA: Camera = Camera {
         world_from_camera: DMat4::IDENTITY,

@@ -298,7 +298,7 @@ fn copy_mask(frame: &Frame, path: &Path, pinhole: bool) -> Result<()> {
         let camera = Camera { distortion: [0.0; 5], ..frame.camera };
         let mut inverse = whole.decode().at(mask)?.into_luma8();
         image::imageops::invert(&mut inverse);
-        let mut rgb = Picture::from_luma(&inverse).resample(&frame.camera, &camera);
+        let mut rgb = Picture::from_luma(inverse).resample(&frame.camera, &camera);
         image::imageops::invert(&mut rgb);
         return image::DynamicImage::from(rgb).into_luma8().save(path).at(path);
     }

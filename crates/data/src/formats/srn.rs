@@ -114,7 +114,7 @@ fn write_picture(frame: &Frame, dir: &Path, options: &WriteOptions, warnings: &m
                 cut(&camera, &points, options.margin, side)
             } else {
                 // Nothing tells where the object is: the largest square in the middle.
-                let [w, h] = picture.size.map(|s| s as f64);
+                let [w, h] = camera.size.map(|s| s as f64);
                 let (middle, half) = (0.5 * (DVec2::new(w, h) - 1.0), 0.5 * w.min(h));
                 let corners = [middle - half, middle + half];
                 cut(&camera, &corners.map(|corner| camera.plane(corner)), 0.0, side)
