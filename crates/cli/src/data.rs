@@ -138,6 +138,9 @@ pub struct Import {
     /// What is up in the source: x, -x, y, -y, z, -z, or `cameras`, what is up in the pictures. Default: z; COLMAP: cameras.
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true, value_parser = up)]
     up: Option<UpAxis>,
+    /// Write every N-th view to OUT/test and the others to OUT/train, to train on the ones and measure on the others.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..))]
+    hold_out: Option<u32>,
     /// Leave frame and units as they are. The default for SRN folders.
     #[arg(long, conflicts_with_all = ["centre", "diagonal", "up"])]
     keep_frame: bool,
@@ -158,7 +161,9 @@ impl Import {
         let asked = self.centre.is_some() || self.diagonal.is_some() || self.up.is_some();
         let keep = self.keep_frame || format == Format::Srn && !asked;
         let options = WriteOptions { axes: None, side: self.side.map(|s| s as usize), margin: self.margin, replace: self.force };
-        refuse_existing(captures.iter().map(|capture| self.out.join(&capture.name)), self.force)?;
+        let folders = if self.hold_out.is_some() { &["train", "test"][..] } else { &[""] };
+        let dirs = captures.iter().flat_map(|capture| folders.iter().map(|folder| self.out.join(folder).join(&capture.name)));
+        refuse_existing(dirs, self.force)?;
         let bar = progress(captures.len() as u64, "objects");
         for capture in &mut captures {
             bar.set_message(capture.name.clone());
@@ -183,10 +188,19 @@ impl Import {
             let total = placed * before.as_ref().map_or(DMat4::IDENTITY, FrameRecord::matrix);
             let record = FrameRecord { world_from_source: total.transpose().to_cols_array_2d(), ..before.unwrap_or(made) };
             capture.transform(&placed);
-            let written = formats::write(capture, Format::Srn, &self.out, 1, &options)?;
-            record.write(&written.dir)?;
+            for folder in folders {
+                let part = match (self.hold_out, *folder) {
+                    (Some(n), folder) => every(capture, n as usize, folder == "test"),
+                    (None, _) => std::mem::take(capture),
+                };
+                let written = formats::write(&part, Format::Srn, &self.out.join(folder), 1, &options)?;
+                record.write(&written.dir)?;
+                bar.suspend(|| report(&part, &written, &format!("frame: {}", record.found_by)));
+                if written.views == 0 {
+                    return Err(format!("{}: no view could be written", written.dir.display()).into());
+                }
+            }
             bar.inc(1);
-            bar.suspend(|| report(capture, &written, &format!("frame: {}", record.found_by)));
         }
         bar.finish_and_clear();
         Ok(true)
@@ -199,6 +213,13 @@ impl Import {
         let Bounds { centre: c, diagonal } = bounds;
         Ok((capture.placement(bounds, up), format!("centre {:.4} {:.4} {:.4}, diagonal {diagonal:.4} ({how})", c.x, c.y, c.z)))
     }
+}
+
+/// Every n-th view of a capture, or the others. What was skipped is told with the others.
+fn every(capture: &Capture, n: usize, these: bool) -> Capture {
+    let numbered = capture.frames.iter().enumerate().filter(|(i, _)| (i % n == n - 1) == these);
+    let skipped = if these { vec![] } else { capture.skipped.clone() };
+    Capture { frames: numbered.map(|(_, frame)| frame.clone()).collect(), skipped, ..capture.clone() }
 }
 
 /// One line on stdout about what was written; what was left out, on stderr.

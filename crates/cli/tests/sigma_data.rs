@@ -127,6 +127,12 @@ fn photographs_go_in_and_poses_come_out_as_they_came() {
     assert_eq!((record["format"].as_str(), record["images"]["0156"].as_str()), (Some("transforms"), Some("images/0156.jpg")));
     assert!(run(&["inspect", &set, "--out", &path("sheet.png")], 0).contains("4 views, 0 problems"));
 
+    // Some views for training, every second one for measuring.
+    let split = path("split");
+    let said = run(&["import", BOX, "--out", &split, "--side", "16", "--hold-out", "2"], 0);
+    assert_eq!(said.matches("2 views written").count(), 2, "{said}");
+    assert!(dir.path().join("split/train/box/rgb/0000.png").exists() && dir.path().join("split/test/box/rgb/0156.png").exists());
+
     // Back in the frame of the photographs: metres, OpenGL axes.
     let out = path("out");
     run(&["export", &instance, "--format", "transforms", "--out", &out], 0);

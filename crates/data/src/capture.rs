@@ -79,9 +79,11 @@ impl Capture {
     fn survey(&self, centre: Option<DVec3>) -> Result<(DVec3, Option<f64>)> {
         let mut silhouettes = vec![];
         for frame in &self.frames {
-            let mut picture = Picture::open(&frame.image, frame.mask.as_deref())?;
-            picture.guess_background();
-            let points = if picture.is_masked() { picture.contour(&frame.camera) } else { vec![] };
+            // A picture that cannot be read tells nothing; who writes it will say so.
+            let points = Picture::open(&frame.image, frame.mask.as_deref()).map_or(vec![], |mut picture| {
+                picture.guess_background();
+                if picture.is_masked() { picture.contour(&frame.camera) } else { vec![] }
+            });
             // A few hundred points are as good, and all pairs of them are compared.
             silhouettes.push(points.iter().copied().step_by(points.len().div_ceil(500).max(1)).collect::<Vec<_>>());
         }

@@ -113,6 +113,12 @@ impl Seen<'_> {
     fn middle(&self) -> DVec3 {
         middle(&self.outline).unwrap_or_default().extend(1.0)
     }
+
+    /// The line of sight to the middle, in the world.
+    fn line(&self) -> (DVec3, DVec3) {
+        let pose = self.frame.camera.world_from_camera;
+        (pose.w_axis.truncate(), pose.transform_vector3(self.middle()))
+    }
 }
 
 impl Report {
@@ -207,9 +213,14 @@ impl Report {
         let most = reaches.iter().copied().reduce(f64::max)?;
         let outside = reaches.iter().filter(|&&reach| reach > OUTSIDE_LIMIT).count();
         if outside > 0 {
+            let lines = seen.iter().filter(|view| !view.outline.is_empty()).map(Seen::line);
+            let advice = match nearest_point(&lines.collect::<Vec<_>>()) {
+                Some(p) if p.length() > 0.15 => format!("the silhouettes meet at ({:.2}, {:.2}, {:.2}) instead", p.x, p.y, p.z),
+                _ => format!("the scale, or the focal length, seems wrong by a factor of {most:.2}"),
+            };
             self.problems.push(format!(
                 "{name}: in {outside} of {} views the object reaches out of the unit sphere around the origin, to {most:.2} of its \
-                 radius; scale, centre, intrinsics or poses are wrong",
+                 radius; {advice}",
                 reaches.len()
             ));
         } else if most < SMALL_LIMIT {

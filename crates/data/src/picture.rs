@@ -63,9 +63,10 @@ impl Picture {
         self.0.pixels().any(|pixel| pixel[3] <= OPAQUE)
     }
 
-    /// Whether the object lies at the picture's edge: part of it is probably cut off.
-    pub fn touches_edge(&self) -> bool {
-        self.edge().any(|pixel| pixel[3] > OPAQUE)
+    /// How much of the picture's edge is the object: where any, part of it is cut off; where most, the mask is inverted.
+    pub fn edge_share(&self) -> f64 {
+        let inside = self.edge().filter(|pixel| pixel[3] > OPAQUE).count();
+        inside as f64 / self.edge().count() as f64
     }
 
     /// The first and last pixel of the object in each row, on the camera's image plane at depth 1, the lens undone.
@@ -188,7 +189,7 @@ mod tests {
         let (_c, mask) = saved(mask);
         let [first, second] = [Picture::open(&alpha, None).unwrap(), Picture::open(&grey, Some(&mask)).unwrap()];
         for picture in [&first, &second] {
-            assert!(picture.is_masked() && !picture.touches_edge());
+            assert!(picture.is_masked() && picture.edge_share() == 0.0);
             let points = picture.contour(&CAMERA);
             let square = cut(&CAMERA, &points, 0.1, 24).unwrap();
             let cropped = picture.resample(&CAMERA, &square);

@@ -499,12 +499,23 @@ fn an_empty_mask_is_skipped_and_counted() {
     let out = formats::write(&capture, Format::Srn, &dir.path().join("set"), 1, &options).unwrap();
     assert_eq!((out.views, out.skipped.len()), (2, 1));
     assert!(out.skipped[0].contains("thing-1.png") && out.skipped[0].contains("empty"), "{:?}", out.skipped);
+    // So is a picture that cannot be read; an inverted mask is remarked on.
+    fs::write(&capture.frames[2].image, fs::read(&capture.frames[1].image).unwrap()[..70].to_vec()).unwrap();
+    capture.frames[0].mask = mask("inverted.png", 255).inspect(|path| {
+        let mut mask = image::open(path).unwrap();
+        mask.invert();
+        mask.save(path).unwrap();
+    });
+    let worse = formats::write(&capture, Format::Srn, &dir.path().join("worse"), 1, &options).unwrap();
+    assert_eq!((worse.views, worse.skipped.len(), worse.warnings.len()), (1, 2, 1), "{worse:?}");
+    assert!(worse.skipped[1].contains("not a readable image") && worse.warnings[0].contains("inverted"), "{worse:?}");
     // What remains can be trained on.
     assert_eq!(SrnSet::open(dir.path().join("set")).unwrap().load(8).unwrap().instances[0].views.len(), 2);
 }
 
 /// A valid source of each format in its own folder, and its parsed files.
 fn sources(dir: &Path) -> Vec<(Format, PathBuf, Vec<PathBuf>)> {
+    fs::create_dir_all(dir).unwrap();
     let start = made(dir, "thing", 3, |_| LENS);
     let files = |format: Format| match format {
         Format::Srn => vec!["intrinsics.txt", "pose/000001.txt", "rgb/000001.png", "frame.json"],
@@ -735,6 +746,18 @@ fn bad_files_are_named_with_the_place() {
         assert_eq!((capture.frames.len(), capture.skipped.len()), (2, 1), "{format:?}");
         assert!(capture.skipped[0].contains("000001"), "{:?}", capture.skipped);
     }
+    // A name with a line break in it does not break the line that tells of it: found by the fuzzer.
+    let (format, path, files) = sources(&dir.path().join("names")).remove(3);
+    let bytes = fs::read(&files[1]).unwrap();
+    let at = bytes.windows(10).position(|name| name == b"000001.png").unwrap();
+    fs::write(&files[1], [&bytes[..at], b"\n", &bytes[at + 1..]].concat()).unwrap();
+    let capture = &formats::read(&path, format, &ReadOptions::default()).unwrap()[0];
+    assert!(capture.skipped.len() == 1 && !capture.skipped[0].contains('\n'), "{:?}", capture.skipped);
+    // Far too long, sparse on disk.
+    let (_, path, files) = sources(&dir.path().join("huge")).remove(1);
+    fs::File::options().write(true).open(&files[0]).unwrap().set_len(3 << 30).unwrap();
+    let error = formats::read(&path, Format::Transforms, &ReadOptions::default()).map(|_| ()).unwrap_err().to_string();
+    assert!(error.contains("3221225472"), "{error}");
     let nothing = tempfile::tempdir().unwrap();
     let error = Format::detect(nothing.path()).unwrap_err().to_string();
     assert!(error.contains("transforms.json") && error.contains("nothing"), "{error}");

@@ -189,7 +189,9 @@ impl<'a> Collector<'a> {
     }
 
     fn skip(&mut self, why: impl ToString) {
-        self.capture.skipped.push(why.to_string());
+        // A name in a file may hold anything, a line break for one.
+        let line = why.to_string().chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect();
+        self.capture.skipped.push(line);
     }
 
     fn add(&mut self, view: View) {
@@ -239,6 +241,9 @@ impl<'a> Collector<'a> {
             Some(folder) => Some(mask_in(folder, &view.image)?),
             None => view.mask,
         };
+        if let Some(path) = mask.as_ref().filter(|path| !path.is_file()) {
+            return Err(Error::Missing { path: path.clone(), why: format!("the mask of {}", view.image.display()) });
+        }
         let camera = Camera { world_from_camera, intrinsics, size, pixel_centre: self.pixel_centre, distortion };
         Ok(Frame { name, image: view.image, mask, camera })
     }

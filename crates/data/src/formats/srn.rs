@@ -74,9 +74,12 @@ pub fn write(capture: &Capture, out: &Path, axes: Axes, options: &WriteOptions) 
     let mut written = Written { dir: dir.clone(), ..Written::default() };
     let mut cameras = vec![];
     for frame in &capture.frames {
-        match write_picture(frame, &dir, options, &mut written.warnings)? {
-            Some(camera) => cameras.push((frame.name.as_str(), camera)),
-            None => written.skipped.push(format!("{}: the mask is empty", frame.image.display())),
+        match write_picture(frame, &dir, options, &mut written.warnings) {
+            Ok(Some(camera)) => cameras.push((frame.name.as_str(), camera)),
+            Ok(None) => written.skipped.push(format!("{}: the mask is empty", frame.image.display())),
+            // A bad picture is left out; a full disk is not.
+            Err(error @ (Error::Image { .. } | Error::Field { .. })) => written.skipped.push(error.to_string()),
+            Err(error) => return Err(error),
         }
     }
     let intrinsics = |camera: &Camera| {
@@ -108,8 +111,11 @@ fn write_picture(frame: &Frame, dir: &Path, options: &WriteOptions, warnings: &m
             picture.guess_background();
             if picture.is_masked() {
                 let points = picture.contour(&camera);
-                if picture.touches_edge() {
-                    warnings.push(format!("{}: the object reaches the picture's edge; is it cut off?", frame.image.display()));
+                let about = |what: &str| format!("{}: {what}", frame.image.display());
+                match picture.edge_share() {
+                    0.0 => {}
+                    share if share < 0.5 => warnings.push(about("the object reaches the picture's edge; is it cut off?")),
+                    _ => warnings.push(about("the mask takes in most of the picture's edge; is it inverted? Objects are white")),
                 }
                 cut(&camera, &points, options.margin, side)
             } else {
