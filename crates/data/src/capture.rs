@@ -84,8 +84,9 @@ impl Capture {
                 picture.guess_background();
                 if picture.is_masked() { picture.contour(&frame.camera) } else { vec![] }
             });
-            // A few hundred points are as good, and all pairs of them are compared.
-            silhouettes.push(points.iter().copied().step_by(points.len().div_ceil(500).max(1)).collect::<Vec<_>>());
+            // A few hundred points are as good, and all pairs of them are compared. Left and right ends alternate: an odd step
+            // takes both.
+            silhouettes.push(points.iter().copied().step_by((points.len() / 500) | 1).collect::<Vec<_>>());
         }
         let known = silhouettes.iter().any(|points| !points.is_empty());
         let rays: Vec<_> = (self.frames.iter().zip(&silhouettes))
@@ -265,6 +266,35 @@ mod tests {
         capture.transform(&DMat4::from_quat(glam::DQuat::from_rotation_arc(DVec3::Z, DVec3::NEG_X)));
         let placed = capture.placement(Bounds { centre: DVec3::ZERO, diagonal: 1.0 }, UpAxis::Cameras);
         assert!(placed.transform_vector3(DVec3::NEG_X).distance(DVec3::Z) < 0.05, "{placed}");
+    }
+
+    #[test]
+    fn silhouettes_say_where_the_object_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let (ball, radius) = (DVec3::new(0.1, -0.2, 0.05), 0.35);
+        // Small, and so large that not every row is looked at.
+        for side in [40usize, 700] {
+            let mut capture = capture(&uniform_sphere(6, 1.5, 2));
+            for (k, frame) in capture.frames.iter_mut().enumerate() {
+                let s = side as f64;
+                frame.camera = Camera { intrinsics: [s, s, 0.5 * s, 0.5 * s], size: [side; 2], ..frame.camera };
+                let centre = frame.camera.world_from_camera.inverse().transform_point3(ball);
+                let edge = (radius / centre.length()).asin();
+                let picture = image::RgbImage::from_fn(side as u32, side as u32, |u, v| {
+                    let ray = frame.camera.plane(glam::DVec2::new(u.into(), v.into())).extend(1.0);
+                    image::Rgb([if ray.angle_between(centre) < edge { 30 } else { 255 }; 3])
+                });
+                frame.image = dir.path().join(format!("{side}-{k}.png"));
+                picture.save(&frame.image).unwrap();
+            }
+            let (bounds, how) = capture.find_bounds(None, None, 1.3).unwrap();
+            // Perspective widens a ball a little, and moves the middle of its box.
+            assert!(bounds.centre.distance(ball) < 0.02, "{side}: {bounds:?}");
+            assert!((bounds.diagonal / 0.7 - 1.04).abs() < 0.06, "{side}: {bounds:?}");
+            assert!(how.contains("silhouette"), "{how}");
+            let (given, _) = capture.find_bounds(Some(ball), Some(0.7), 1.3).unwrap();
+            assert_eq!(given, Bounds { centre: ball, diagonal: 0.7 });
+        }
     }
 
     #[test]
