@@ -160,7 +160,13 @@ impl Import {
         }
         let asked = self.centre.is_some() || self.diagonal.is_some() || self.up.is_some();
         let keep = self.keep_frame || format == Format::Srn && !asked;
-        let options = WriteOptions { axes: None, side: self.side.map(|s| s as usize), margin: self.margin, replace: self.force };
+        let options = WriteOptions {
+            axes: None,
+            side: self.side.map(|s| s as usize),
+            placed: !keep || format == Format::Srn,
+            margin: self.margin,
+            replace: self.force,
+        };
         let folders = if self.hold_out.is_some() { &["train", "test"][..] } else { &[""] };
         let dirs = captures.iter().flat_map(|capture| folders.iter().map(|folder| self.out.join(folder).join(&capture.name)));
         refuse_existing(dirs, self.force)?;
@@ -208,10 +214,11 @@ impl Import {
 
     fn place(&self, format: Format, capture: &Capture) -> Result<(DMat4, String)> {
         let (bounds, how) = capture.find_bounds(self.centre, self.diagonal, self.radius)?;
-        let colmap = matches!(format, Format::Colmap | Format::ColmapText);
-        let up = self.up.unwrap_or(if colmap { UpAxis::Cameras } else { UpAxis::Axis(2, false) });
         let Bounds { centre: c, diagonal } = bounds;
-        Ok((capture.placement(bounds, up), format!("centre {:.4} {:.4} {:.4}, diagonal {diagonal:.4} ({how})", c.x, c.y, c.z)))
+        Ok((
+            capture.placement(bounds, self.up.unwrap_or(format.up())),
+            format!("centre {:.4} {:.4} {:.4}, diagonal {diagonal:.4} ({how})", c.x, c.y, c.z),
+        ))
     }
 }
 
@@ -394,7 +401,7 @@ impl Inspect {
         let (format, mut captures) = self.source.read()?;
         let origin = if format == Format::Srn { Origin::Given } else { Origin::Found };
         if origin == Origin::Found {
-            inspect::place_all(&mut captures, 1.3)?;
+            inspect::place_all(&mut captures, format.up())?;
         }
         let report = inspect::inspect(&captures, self.source.convention.unwrap_or(format.axes()), origin);
         if self.json {

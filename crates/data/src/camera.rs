@@ -209,6 +209,19 @@ pub fn off_axis_deg(world_from_camera: &DMat4) -> f64 {
     forward.angle_between(-centre).to_degrees()
 }
 
+/// Points around the outline of the sphere of radius 0.5 around the origin, where lines of sight touch it; none from inside.
+pub(crate) fn unit_sphere_seen_from(eye: DVec3) -> Vec<DVec3> {
+    let Some(towards) = eye.try_normalize().filter(|_| eye.length() > 0.5) else { return vec![] };
+    let lift = 0.25 / eye.length();
+    let (a, b) = towards.any_orthonormal_pair();
+    let radius = (0.25 - lift * lift).sqrt();
+    let point = |i: u32| {
+        let (sin, cos) = (f64::from(i) * TAU / 48.0).sin_cos();
+        lift * towards + radius * (cos * a + sin * b)
+    };
+    (0..48).map(point).collect()
+}
+
 /// The focal length in pixels at which the sphere of radius 0.5 around the origin (it holds every unit-diagonal object) just
 /// fits into a square image of `side` pixels, seen from `radius` by a camera with its principal point at `side / 2`.
 pub fn fitting_focal_px(side: usize, radius: f64) -> f64 {
@@ -328,6 +341,16 @@ mod tests {
         let mut nan = good;
         nan.y_axis.x = f64::NAN;
         assert!(rigid_error(&nan).is_nan());
+    }
+
+    #[test]
+    fn the_outline_of_the_unit_sphere_touches_it() {
+        let eye = DVec3::new(0.9, -0.4, 1.1);
+        let angle = (0.5 / eye.length()).asin();
+        for p in unit_sphere_seen_from(eye) {
+            assert!((p.length() - 0.5).abs() < 1e-12 && ((p - eye).angle_between(-eye) - angle).abs() < 1e-12, "{p}");
+        }
+        assert!(unit_sphere_seen_from(DVec3::new(0.3, 0.3, 0.0)).is_empty());
     }
 
     #[test]

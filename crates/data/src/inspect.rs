@@ -1,7 +1,7 @@
 //! What a source of posed pictures holds and what is probably wrong with it.
 
-use crate::camera::Axes;
-use crate::capture::{Capture, Frame, nearest_point};
+use crate::camera::{Axes, unit_sphere_seen_from};
+use crate::capture::{Capture, Frame, UpAxis, nearest_point};
 use crate::error::Result;
 use crate::picture::{Picture, middle};
 use crate::sheet::{self, Colour};
@@ -282,10 +282,10 @@ fn diagnosis(name: &str, seen: &[Seen], assumed: Axes, origin: Origin, facing: u
 }
 
 /// Brings captures that are not in our frame into it, for looking at them: by the box that the source knows, else by silhouettes.
-pub fn place_all(captures: &mut [Capture], radius: f64) -> Result<()> {
+pub fn place_all(captures: &mut [Capture], up: UpAxis) -> Result<()> {
     for capture in captures {
-        let (bounds, _) = capture.find_bounds(None, None, radius)?;
-        let placed = capture.placement(bounds, crate::capture::UpAxis::Axis(2, false));
+        let (bounds, _) = capture.find_bounds(None, None, 1.3)?;
+        let placed = capture.placement(bounds, up);
         capture.transform(&placed);
     }
     Ok(())
@@ -336,18 +336,8 @@ fn draw_axes(picture: &mut RgbImage, frame: &Frame) {
             sheet::line(picture, from, to, colour);
         }
     };
-    let eye = camera.world_from_camera.w_axis.truncate();
-    if let Some(towards) = eye.try_normalize().filter(|_| eye.length() > 0.5) {
-        // Where lines of sight touch the sphere of radius 0.5.
-        let lift = 0.25 / eye.length();
-        let (a, b) = towards.any_orthonormal_pair();
-        let radius = (0.25 - lift * lift).sqrt();
-        let point = |i: u32| {
-            let angle = f64::from(i) * std::f64::consts::TAU / 48.0;
-            lift * towards + radius * (angle.cos() * a + angle.sin() * b)
-        };
-        (0..48).for_each(|i| draw(point(i), point(i + 1), sheet::GREY));
-    }
+    let outline = unit_sphere_seen_from(camera.world_from_camera.w_axis.truncate());
+    outline.iter().zip(outline.iter().cycle().skip(1)).for_each(|(from, to)| draw(*from, *to, sheet::GREY));
     for (axis, colour) in DVec3::AXES.into_iter().zip(sheet::AXES) {
         draw(DVec3::ZERO, 0.5 * axis, colour);
     }

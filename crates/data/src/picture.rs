@@ -23,16 +23,16 @@ impl Picture {
         };
         let mut picture = decode(path)?.into_rgba8();
         if let Some(path) = mask {
-            // A mask is white, or opaque, where the object is.
+            // A mask is white where the object is; one that is transparent, as background removers write it, is opaque there.
             let mask = decode(path)?.into_luma_alpha8();
+            let channel = usize::from(mask.pixels().any(|mask| mask[1] < 255));
             let (width, height) = picture.dimensions();
             if mask.dimensions() != (width, height) {
                 let expected = format!("{width}×{height}, as its picture");
                 return Err(Error::field(path, "size", expected, format!("{}×{}", mask.width(), mask.height())));
             }
             for (pixel, mask) in picture.pixels_mut().zip(mask.pixels()) {
-                let product = u32::from(pixel[3]) * u32::from(mask[0]) * u32::from(mask[1]);
-                pixel[3] = ((product + 255 * 255 / 2) / (255 * 255)) as u8;
+                pixel[3] = ((u32::from(pixel[3]) * u32::from(mask[channel]) + 127) / 255) as u8;
             }
         }
         Ok(Self(picture))
@@ -180,7 +180,7 @@ mod tests {
 
     #[test]
     fn masks_and_transparency_become_white_and_bound_the_object() {
-        // A black rectangle, x 20..30 and y 10..18, on grey; once by a mask, once by transparency.
+        // A black rectangle, x 20..30 and y 10..18, on grey: by a mask, by transparency, by a mask that is transparent.
         let object = |x: u32, y: u32| (20..30).contains(&x) && (10..18).contains(&y);
         let alpha = RgbaImage::from_fn(64, 48, |x, y| if object(x, y) { Rgba([0, 0, 0, 255]) } else { Rgba([99, 99, 99, 0]) });
         let grey = RgbImage::from_fn(64, 48, |x, y| Rgb(if object(x, y) { [0; 3] } else { [99; 3] }));
@@ -188,7 +188,8 @@ mod tests {
         let [(_a, alpha), (_b, grey)] = [saved(alpha), saved(grey)];
         let (_c, mask) = saved(mask);
         let [first, second] = [Picture::open(&alpha, None).unwrap(), Picture::open(&grey, Some(&mask)).unwrap()];
-        for picture in [&first, &second] {
+        let third = Picture::open(&grey, Some(&alpha)).unwrap();
+        for picture in [&first, &second, &third] {
             assert!(picture.is_masked() && picture.edge_share() == 0.0);
             let points = picture.contour(&CAMERA);
             let square = cut(&CAMERA, &points, 0.1, 24).unwrap();

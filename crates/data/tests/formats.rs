@@ -469,6 +469,18 @@ fn photographs_become_squares_around_the_object() {
     assert!(report.problems.is_empty(), "{:?}", report.problems);
     assert!(report.instances[0].filled.is_some_and(|f| (0.75..1.1).contains(&f)), "{:?}", report.instances[0].filled);
 
+    // Without masks the square is around the unit sphere, and the room stays in the picture.
+    let mut bare = capture.clone();
+    bare.frames.iter_mut().for_each(|frame| frame.mask = None);
+    let options = WriteOptions { placed: true, ..options };
+    let written = formats::write(&bare, Format::Srn, &dir.path().join("bare"), 1, &options).unwrap();
+    assert!(written.warnings.len() == 1 && written.warnings[0].contains("4 of 4 pictures have no mask"), "{written:?}");
+    for frame in &read(&written.dir, Format::Srn).frames {
+        let (origin, depth) = frame.camera.project(DVec3::ZERO);
+        let radius = frame.camera.intrinsics[0] * (0.5 / depth);
+        assert!((origin - 23.5).length() < 2.0 && (18.0..22.0).contains(&radius), "{origin} {radius}");
+    }
+
     // With the record, poses go back to what the file says.
     squares.restore();
     let source = read(Path::new(BOX), Format::Transforms);
@@ -479,7 +491,7 @@ fn photographs_become_squares_around_the_object() {
     let mut wrong =
         formats::read(Path::new(BOX), Format::Transforms, &ReadOptions { axes: Some(Axes::OpenCv), ..Default::default() })
             .unwrap();
-    inspect::place_all(&mut wrong, 1.3).unwrap();
+    inspect::place_all(&mut wrong, UpAxis::Cameras).unwrap();
     let report = inspect::inspect(&wrong, Axes::OpenCv, Origin::Found);
     assert!(report.problems.iter().any(|p| p.contains("--convention opengl")), "{:?}", report.problems);
 }
@@ -500,7 +512,7 @@ fn an_empty_mask_is_skipped_and_counted() {
     assert_eq!((out.views, out.skipped.len()), (2, 1));
     assert!(out.skipped[0].contains("thing-1.png") && out.skipped[0].contains("empty"), "{:?}", out.skipped);
     // So is a picture that cannot be read; an inverted mask is remarked on.
-    fs::write(&capture.frames[2].image, fs::read(&capture.frames[1].image).unwrap()[..70].to_vec()).unwrap();
+    fs::write(&capture.frames[2].image, &fs::read(&capture.frames[1].image).unwrap()[..70]).unwrap();
     capture.frames[0].mask = mask("inverted.png", 255).inspect(|path| {
         let mut mask = image::open(path).unwrap();
         mask.invert();
@@ -547,7 +559,7 @@ fn survive(format: Format, path: &Path) -> Result<(), TestCaseError> {
     let report = inspect::inspect(&captures, format.axes(), Origin::Given);
     prop_assert!(report.problems.iter().all(|line| !line.contains('\n')));
     inspect::contact_sheet(&captures, 2, 1);
-    inspect::place_all(&mut captures, 1.3).ok();
+    inspect::place_all(&mut captures, format.up()).ok();
     let dir = tempfile::tempdir().unwrap();
     let options = WriteOptions { side: Some(8), ..WriteOptions::default() };
     captures.iter().for_each(|capture| drop(formats::write(capture, Format::Srn, dir.path(), 1, &options)));

@@ -9,7 +9,7 @@ pub mod srn;
 pub mod transforms;
 
 use crate::camera::{Axes, Camera};
-use crate::capture::{Capture, Frame};
+use crate::capture::{Capture, Frame, UpAxis};
 use crate::error::{At, Error, Result};
 use crate::picture::Picture;
 use crate::srn::{picture_size, rigid, write_png};
@@ -49,6 +49,11 @@ impl Format {
     /// The axes of its cameras.
     pub fn axes(self) -> Axes {
         if self == Self::Transforms { Axes::OpenGl } else { Axes::OpenCv }
+    }
+
+    /// What is up in its world, where it does not say: COLMAP's axes mean nothing.
+    pub fn up(self) -> UpAxis {
+        if matches!(self, Self::Colmap | Self::ColmapText) { UpAxis::Cameras } else { UpAxis::Axis(2, false) }
     }
 
     /// The format of a file or folder, by the files that only one format has.
@@ -120,6 +125,8 @@ pub struct WriteOptions {
     pub axes: Option<Axes>,
     /// SRN only: squares of this side, cut around the object; else pictures stay whole.
     pub side: Option<usize>,
+    /// The capture is in our frame: where no mask tells the object, the unit sphere does. Else squares are cut from the middle.
+    pub placed: bool,
     /// Room around the object on each side of a square, as a share of its extent.
     pub margin: f64,
     /// Replace what is there.

@@ -1,7 +1,7 @@
 //! SRN folders as captures: what archives in the wild do to them is read here, and turned into what [`crate::srn`] trains on.
 
 use super::{Collector, Format, ReadOptions, View, WriteOptions, Written};
-use crate::camera::{Axes, Camera};
+use crate::camera::{Axes, Camera, unit_sphere_seen_from};
 use crate::capture::{Capture, Frame, FrameRecord};
 use crate::error::{Error, Result, read_text};
 use crate::picture::{Picture, cut};
@@ -73,14 +73,19 @@ pub fn write(capture: &Capture, out: &Path, axes: Axes, options: &WriteOptions) 
     let writer = InstanceWriter::bare(&dir, options.replace)?;
     let mut written = Written { dir: dir.clone(), ..Written::default() };
     let mut cameras = vec![];
+    let mut unmasked = 0;
     for frame in &capture.frames {
-        match write_picture(frame, &dir, options, &mut written.warnings) {
+        match write_picture(frame, &dir, options, &mut written.warnings, &mut unmasked) {
             Ok(Some(camera)) => cameras.push((frame.name.as_str(), camera)),
             Ok(None) => written.skipped.push(format!("{}: the mask is empty", frame.image.display())),
             // A bad picture is left out; a full disk is not.
             Err(error @ (Error::Image { .. } | Error::Field { .. })) => written.skipped.push(error.to_string()),
             Err(error) => return Err(error),
         }
+    }
+    if unmasked > 0 {
+        let all = capture.frames.len();
+        written.warnings.push(format!("{}: {unmasked} of {all} pictures have no mask: their background stays", dir.display()));
     }
     let intrinsics = |camera: &Camera| {
         let [fx, fy, cx, cy] = camera.with_pixel_centre(0.0).intrinsics;
@@ -96,11 +101,27 @@ pub fn write(capture: &Capture, out: &Path, axes: Axes, options: &WriteOptions) 
     Ok(written)
 }
 
+/// The unit sphere's outline on the image plane, where the camera sees it whole.
+fn sphere(camera: &Camera) -> Option<Vec<DVec2>> {
+    let camera_from_world = camera.world_from_camera.inverse();
+    let points = unit_sphere_seen_from(camera.world_from_camera.w_axis.truncate());
+    let points = points.into_iter().map(|point| camera_from_world.transform_point3(point));
+    let plane: Option<Vec<_>> = points.map(|p| (p.z > 0.1 * p.length()).then(|| DVec2::new(p.x, p.y) / p.z)).collect();
+    plane.filter(|plane| !plane.is_empty())
+}
+
 /// Writes a picture as it is where nothing must be done to it; gives its camera, or nothing where the object is not seen.
-fn write_picture(frame: &Frame, dir: &Path, options: &WriteOptions, warnings: &mut Vec<String>) -> Result<Option<Camera>> {
+fn write_picture(
+    frame: &Frame,
+    dir: &Path,
+    options: &WriteOptions,
+    warnings: &mut Vec<String>,
+    unmasked: &mut usize,
+) -> Result<Option<Camera>> {
     let camera = frame.camera.with_pixel_centre(0.0);
     let folder = dir.join("rgb");
-    let readable = frame.image.extension().is_some_and(|extension| ["png", "jpg", "jpeg"].iter().any(|e| extension == *e));
+    let extension = frame.image.extension().unwrap_or_default();
+    let readable = ["png", "jpg", "jpeg"].iter().any(|known| extension.eq_ignore_ascii_case(known));
     if options.side.is_none() && frame.mask.is_none() && camera.is_pinhole() && readable {
         return super::copy_picture(frame, &folder, &frame.name, false).map(|_| Some(camera));
     }
@@ -109,6 +130,7 @@ fn write_picture(frame: &Frame, dir: &Path, options: &WriteOptions, warnings: &m
         None => Some(Camera { distortion: [0.0; 5], ..camera }),
         Some(side) => {
             picture.guess_background();
+            *unmasked += usize::from(!picture.is_masked());
             if picture.is_masked() {
                 let points = picture.contour(&camera);
                 let about = |what: &str| format!("{}: {what}", frame.image.display());
@@ -118,6 +140,8 @@ fn write_picture(frame: &Frame, dir: &Path, options: &WriteOptions, warnings: &m
                     _ => warnings.push(about("the mask takes in most of the picture's edge; is it inverted? Objects are white")),
                 }
                 cut(&camera, &points, options.margin, side)
+            } else if let Some(outline) = sphere(&camera).filter(|_| options.placed) {
+                cut(&camera, &outline, options.margin, side)
             } else {
                 // Nothing tells where the object is: the largest square in the middle.
                 let [w, h] = camera.size.map(|s| s as f64);
