@@ -11,6 +11,9 @@ use srn_data::{Camera, SrnSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+mod spoil;
+use spoil::{config, spoiled};
+
 const BOX: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/box");
 /// Length of the box's diagonal in metres.
 const BOX_DIAGONAL: f64 = 0.3285;
@@ -566,78 +569,14 @@ fn survive(format: Format, path: &Path) -> Result<(), TestCaseError> {
     Ok(())
 }
 
-/// One change of a file.
-#[derive(Debug, Clone)]
-enum Change {
-    Cut(usize),
-    Flip(usize, u8),
-    Insert(usize, Vec<u8>),
-    /// A word that looks like a number becomes another.
-    Number(usize, &'static str),
-}
-
-const NUMBERS: [&str; 12] =
-    ["NaN", "inf", "-1e308", "1e999", "0", "-0.0", "1e-320", "4294967296", "18446744073709551615", "\"x\"", "[]", "null"];
-
-fn change() -> impl Strategy<Value = Change> {
-    prop_oneof![
-        any::<usize>().prop_map(Change::Cut),
-        (any::<usize>(), any::<u8>()).prop_map(|(at, byte)| Change::Flip(at, byte)),
-        (any::<usize>(), proptest::collection::vec(any::<u8>(), 1..40)).prop_map(|(at, bytes)| Change::Insert(at, bytes)),
-        (any::<usize>(), proptest::sample::select(&NUMBERS[..])).prop_map(|(at, number)| Change::Number(at, number)),
-    ]
-}
-
-impl Change {
-    fn apply(&self, bytes: &mut Vec<u8>) {
-        let length = bytes.len().max(1);
-        match self {
-            Change::Cut(at) => bytes.truncate(at % length),
-            Change::Flip(at, byte) => bytes.iter_mut().skip(at % length).take(1).for_each(|b| *b ^= byte),
-            Change::Insert(at, new) => drop(bytes.splice(at % length..at % length, new.iter().copied())),
-            Change::Number(at, number) => {
-                let is_digit = |b: &u8| b"0123456789.-e".contains(b);
-                let start = (at % length..bytes.len()).find(|&i| is_digit(&bytes[i])).unwrap_or(bytes.len());
-                let end = (start..bytes.len()).find(|&i| !is_digit(&bytes[i])).unwrap_or(bytes.len());
-                bytes.splice(start..end, number.bytes());
-            }
-        }
-    }
-}
-
-/// What a file is replaced by.
-#[derive(Debug, Clone)]
-enum Spoiled {
-    /// The file with changes.
-    Changed(Vec<Change>),
-    /// Anything.
-    Bytes(Vec<u8>),
-}
-
-fn spoiled() -> impl Strategy<Value = Spoiled> {
-    prop_oneof![
-        6 => proptest::collection::vec(change(), 1..4).prop_map(Spoiled::Changed),
-        1 => proptest::collection::vec(any::<u8>(), 0..300).prop_map(Spoiled::Bytes),
-        1 => "[0-9eE.,:\\-\\[\\]{}\" \n]{0,200}".prop_map(|text| Spoiled::Bytes(text.into_bytes())),
-    ]
-}
-
 #[test]
 fn no_file_makes_a_reader_panic_or_pass_on_a_wrong_pose() {
-    // For a long search: SRN_FUZZ_CASES=100000.
-    let cases = std::env::var("SRN_FUZZ_CASES").ok().and_then(|text| text.parse().ok()).unwrap_or(96);
     let dir = tempfile::tempdir().unwrap();
     for (format, path, files) in sources(dir.path()) {
         for file in &files {
             let good = fs::read(file).unwrap();
-            let config = ProptestConfig { cases, failure_persistence: None, ..ProptestConfig::default() };
-            let found = proptest::test_runner::TestRunner::new(config).run(&spoiled(), |spoiled| {
-                let mut bytes = good.clone();
-                match &spoiled {
-                    Spoiled::Changed(changes) => changes.iter().for_each(|change| change.apply(&mut bytes)),
-                    Spoiled::Bytes(other) => bytes.clone_from(other),
-                }
-                fs::write(file, bytes).unwrap();
+            let found = proptest::test_runner::TestRunner::new(config(96)).run(&spoiled(), |spoiled| {
+                fs::write(file, spoiled.of(&good)).unwrap();
                 survive(format, &path)
             });
             fs::write(file, good).unwrap();
@@ -666,14 +605,9 @@ fn results_and_models_survive_anything() {
             "symmetries_discrete": [[-1,0,0,4, 0,-1,0,0, 0,0,1,0, 0,0,0,1]]}}"#
             .to_vec(),
     ];
-    proptest!(ProptestConfig { cases: 500, failure_persistence: None, ..ProptestConfig::default() }, |(spoiled in spoiled())| {
+    proptest!(config(500), |(spoiled in spoiled())| {
         for (path, good) in [&results, &models].into_iter().zip(&good) {
-            let mut bytes = good.clone();
-            match &spoiled {
-                Spoiled::Changed(changes) => changes.iter().for_each(|change| change.apply(&mut bytes)),
-                Spoiled::Bytes(other) => bytes.clone_from(other),
-            }
-            fs::write(path, bytes).unwrap();
+            fs::write(path, spoiled.of(good)).unwrap();
         }
         for estimate in bop::read_results(&results).unwrap_or_default() {
             prop_assert!(rigid_error(&estimate.camera_from_object) <= 1e-3);

@@ -6,7 +6,7 @@ use sigma_cli::common::{Result, finish};
 use sigma_cli::data::{Export, Import, Inspect};
 use srn_data::mesh::{Mesh, Up};
 use srn_data::srn::{InstanceWriter, Intrinsics};
-use srn_data::{camera, ldraw, obj};
+use srn_data::{camera, gltf, ldraw, obj, ply, stl};
 use srn_gpu::raster::{self, Rasterizer};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -35,8 +35,8 @@ enum Command {
 
 #[derive(Args)]
 struct Render {
-    /// Meshes: Wavefront .obj, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The instance is called NAME, or
-    /// like the file.
+    /// Meshes: .obj, .stl, .ply, .gltf, .glb, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The instance is called
+    /// NAME, or like the file.
     #[arg(required = true, value_name = "[NAME=]MESH", value_parser = named_mesh)]
     meshes: Vec<(String, PathBuf)>,
     /// The data set's folder; instances are made inside.
@@ -63,9 +63,9 @@ struct Render {
     /// Angle of view in degrees, instead of --focal.
     #[arg(long, value_parser = |x: &str| between(x, 0.0, 180.0))]
     fov: Option<f64>,
-    /// Which axis points up in .obj files (LDraw has its own).
-    #[arg(long, value_enum, default_value_t = ObjUp::Y)]
-    up: ObjUp,
+    /// Which axis points up in the meshes. Default: y in .obj and glTF, z in .stl and .ply; LDraw has its own.
+    #[arg(long, value_enum)]
+    up: Option<MeshUp>,
     /// Replace instances that exist in the output folder.
     #[arg(long)]
     force: bool,
@@ -83,7 +83,7 @@ enum Cameras {
 }
 
 #[derive(Clone, Copy, ValueEnum)]
-enum ObjUp {
+enum MeshUp {
     Y,
     Z,
 }
@@ -174,15 +174,21 @@ fn named_mesh(argument: &str) -> std::result::Result<(String, PathBuf), String> 
     }
 }
 
-fn load_mesh(path: &Path, up: ObjUp) -> Result<Mesh> {
+fn load_mesh(path: &Path, up: Option<MeshUp>) -> Result<Mesh> {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    let (mut mesh, up) = match (extension.as_str(), up) {
-        ("dat", _) => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
-        ("obj", ObjUp::Y) => (obj::load(path)?, Up::Y),
-        ("obj", ObjUp::Z) => (obj::load(path)?, Up::Z),
-        _ => return Err(format!("{}: expected a .obj or .dat mesh", path.display()).into()),
+    let (mut mesh, usual) = match extension.as_str() {
+        "dat" => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
+        "obj" => (obj::load(path)?, Up::Y),
+        "gltf" | "glb" => (gltf::load(path)?, Up::Y),
+        "stl" => (stl::load(path)?, Up::Z),
+        "ply" => (ply::load(path)?, Up::Z),
+        _ => return Err(format!("{}: expected a .obj, .stl, .ply, .gltf, .glb or .dat mesh", path.display()).into()),
     };
-    mesh.normalise(up);
+    mesh.normalise(match (usual, up) {
+        (Up::MinusY, _) | (_, None) => usual,
+        (_, Some(MeshUp::Y)) => Up::Y,
+        (_, Some(MeshUp::Z)) => Up::Z,
+    });
     Ok(mesh)
 }
 
