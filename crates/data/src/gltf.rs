@@ -2,8 +2,10 @@
 
 use crate::error::{Error, Result, read_bytes};
 use crate::mesh::{Mesh, Part};
-use glam::{Mat3, Mat4, Vec2, Vec3};
+use glam::{DVec2, DVec3, Mat3, Mat4, Vec3};
+use gltf::accessor::DataType;
 use gltf::image::Format;
+use gltf::mesh::Semantic;
 use image::{DynamicImage, RgbaImage};
 use std::collections::HashMap;
 use std::path::Path;
@@ -75,13 +77,21 @@ impl Reader<'_> {
         // Factors are linear, our colours as displayed.
         let [r, g, b, _] = surface.base_color_factor();
         let factor = Vec3::new(r, g, b).map(|c| c.clamp(0.0, 1.0).powf(1.0 / 2.2));
-        let reader = primitive.reader(|buffer| self.buffers.get(buffer.index()).map(|data| &data.0[..]));
-        let positions: Vec<_> = reader.read_positions().into_iter().flatten().map(Vec3::from_array).collect();
-        let normals: Vec<_> = reader.read_normals().into_iter().flatten().map(Vec3::from_array).collect();
-        let uvs: Vec<_> = reader.read_tex_coords(set).into_iter().flat_map(|uvs| uvs.into_f32()).map(Vec2::from_array).collect();
-        let colours: Vec<_> = reader.read_colors(0).into_iter().flat_map(|c| c.into_rgb_f32()).map(Vec3::from_array).collect();
-        let indices = reader.read_indices().map(|indices| indices.into_u32().map(|i| i as usize).collect());
-        let indices: Vec<usize> = indices.unwrap_or_else(|| (0..positions.len()).collect());
+        let mut read = |semantic: Semantic| -> Vec<[f64; 4]> {
+            let values = primitive.get(&semantic).map(|accessor| values(&accessor, &self.buffers));
+            let refused = |error| self.mesh.warnings.push(format!("{semantic:?}: {error}"));
+            values.transpose().map_err(refused).ok().flatten().unwrap_or_default()
+        };
+        let vector = |[x, y, z, _]: [f64; 4]| DVec3::new(x, y, z).as_vec3();
+        let positions: Vec<_> = read(Semantic::Positions).into_iter().map(vector).collect();
+        let normals: Vec<_> = read(Semantic::Normals).into_iter().map(vector).collect();
+        let uvs: Vec<_> = read(Semantic::TexCoords(set)).into_iter().map(|[u, v, ..]| DVec2::new(u, v).as_vec2()).collect();
+        let colours: Vec<_> = read(Semantic::Colors(0)).into_iter().map(vector).collect();
+        let indices: Vec<usize> = match primitive.indices().map(|accessor| values(&accessor, &self.buffers)) {
+            None => (0..positions.len()).collect(),
+            Some(Ok(indices)) => indices.into_iter().map(|[i, ..]| i as usize).collect(),
+            Some(Err(error)) => return self.mesh.warnings.push(format!("left out, indices: {error}")),
+        };
         let turn = Mat3::from_mat4(placed).inverse().transpose();
         let start = self.mesh.vertices.len();
         let mut left_out = 0;
@@ -125,6 +135,41 @@ impl Reader<'_> {
         self.textures.insert(picture.index(), found);
         found
     }
+}
+
+/// The numbers of an accessor, up to four in each, the missing ones 0. The crate's own iterators trust the file's strides and
+/// counts; these do not.
+fn values(accessor: &gltf::Accessor, buffers: &[gltf::buffer::Data]) -> std::result::Result<Vec<[f64; 4]>, String> {
+    let (kind, wide) = (accessor.data_type(), accessor.dimensions().multiplicity());
+    let (size, Some(view)) = (kind.size(), accessor.view()) else { return Err("no numbers".into()) };
+    if accessor.sparse().is_some() || wide > 4 {
+        return Err("sparse numbers and matrices are not read".into());
+    }
+    let bytes = buffers.get(view.buffer().index()).and_then(|buffer| buffer.get(view.offset()..)?.get(..view.length()));
+    let rows = bytes.and_then(|bytes| bytes.get(accessor.offset()..)).ok_or("outside of the buffer")?;
+    let stride = view.stride().unwrap_or(wide * size);
+    let count = accessor.count();
+    let whole = stride >= wide * size && count.checked_mul(stride).is_some_and(|all| all <= rows.len() + stride - wide * size);
+    if !whole {
+        return Err(format!("{count} times {stride} bytes, but there are {}", rows.len()));
+    }
+    // Whole numbers may stand for fractions.
+    let fraction = |value: f64, most: f64| if accessor.normalized() { (value / most).max(-1.0) } else { value };
+    let number = |bytes: &[u8]| match (kind, bytes) {
+        (DataType::I8, &[a]) => fraction(f64::from(a as i8), 127.0),
+        (DataType::U8, &[a]) => fraction(f64::from(a), 255.0),
+        (DataType::I16, &[a, b]) => fraction(f64::from(i16::from_le_bytes([a, b])), 32767.0),
+        (DataType::U16, &[a, b]) => fraction(f64::from(u16::from_le_bytes([a, b])), 65535.0),
+        (DataType::U32, &[a, b, c, d]) => f64::from(u32::from_le_bytes([a, b, c, d])),
+        (DataType::F32, &[a, b, c, d]) => f64::from(f32::from_le_bytes([a, b, c, d])),
+        _ => f64::NAN,
+    };
+    let row = |i: usize| {
+        let mut row = [0.0; 4];
+        row.iter_mut().zip(rows[i * stride..].chunks_exact(size)).take(wide).for_each(|(value, bytes)| *value = number(bytes));
+        row
+    };
+    Ok((0..count).map(row).collect())
 }
 
 fn rgba(data: gltf::image::Data) -> Option<RgbaImage> {
