@@ -298,8 +298,9 @@ pub fn contact_sheet(captures: &[Capture], columns: usize, rows: usize) -> RgbIm
     const THUMBNAIL: u32 = 128;
     let mut cells = vec![];
     for capture in captures.iter().take(rows) {
+        let shown = columns.min(capture.frames.len());
         for i in 0..columns {
-            let picked = capture.frames.get(i * capture.frames.len() / columns).filter(|_| i < capture.frames.len());
+            let picked = (i < shown).then(|| &capture.frames[i * capture.frames.len() / shown]);
             let picture = picked.and_then(|frame| {
                 let thumbnail =
                     image::open(&frame.image).ok()?.resize(THUMBNAIL, THUMBNAIL, image::imageops::FilterType::Triangle);
