@@ -89,7 +89,13 @@ fn points_appear_where_the_camera_projects_them() {
     let blobs = model(&rasterizer, &blobs);
     for pose in camera::uniform_sphere(20, 1.3, 3) {
         let picture = rasterizer.render(&blobs, &view(&pose)).unwrap();
-        let camera = Camera { world_from_camera: pose, intrinsics: INTRINSICS, size: [SIDE as usize; 2], pixel_centre: 0.0 };
+        let camera = Camera {
+            world_from_camera: pose,
+            intrinsics: INTRINSICS,
+            size: [SIDE as usize; 2],
+            pixel_centre: 0.0,
+            distortion: [0.0; 5],
+        };
         for (channel, (point, _)) in points.iter().enumerate() {
             // The share of a pixel that the blob covers: its colour lacks the other two channels, however it is lit.
             let dark = |p: &[u8], c: usize| 255.0 - f64::from(p[c]);

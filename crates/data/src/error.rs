@@ -78,3 +78,21 @@ impl<T> At<T> for image::ImageResult<T> {
         })
     }
 }
+
+/// Larger text files are refused: none of the formats comes near, and a wrong file should not fill the memory.
+const LONGEST_TEXT: u64 = 1 << 30;
+
+/// Reads a text file of bearable length.
+pub(crate) fn read_text(path: &Path) -> Result<String> {
+    String::from_utf8(read_bytes(path)?)
+        .map_err(|error| Error::field(path, format!("byte {}", error.utf8_error().valid_up_to()), "UTF-8 text", "other bytes"))
+}
+
+/// Reads a file of bearable length.
+pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
+    let length = std::fs::metadata(path).at(path)?.len();
+    if length > LONGEST_TEXT {
+        return Err(Error::field(path, "length", format!("at most {LONGEST_TEXT} bytes"), length));
+    }
+    std::fs::read(path).at(path)
+}

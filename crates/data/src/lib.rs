@@ -6,16 +6,23 @@
 //! `v·W + u`; images are RGB in [-1, 1].
 
 pub mod camera;
+pub mod capture;
 mod error;
+pub mod formats;
+pub mod gltf;
 pub mod inspect;
 pub mod ldraw;
 pub mod mesh;
 pub mod obj;
+mod picture;
 pub mod pixels;
+pub mod ply;
 pub mod sheet;
 pub mod srn;
+pub mod stl;
 
 pub use camera::Camera;
+pub use capture::Capture;
 pub use error::{Error, Result};
 pub use mesh::Mesh;
 pub use srn::{Dataset, Instance, LoadedView, SrnSet};

@@ -1,8 +1,10 @@
 //! Triangles with colours and textures, ready to be drawn.
 
+use crate::error::{Error, Result};
 use glam::{Affine3A, Vec2, Vec3};
 use image::RgbaImage;
 use std::ops::Range;
+use std::path::Path;
 
 /// A corner of a triangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -57,6 +59,11 @@ impl Mesh {
         if normal != Vec3::ZERO {
             self.vertices.extend(corners.map(|position| Vertex { position, normal, colour, uv: Vec2::ZERO }));
         }
+    }
+
+    /// The mesh, if it has a triangle.
+    pub(crate) fn with_faces(self, path: &Path) -> Result<Self> {
+        if self.vertices.is_empty() { Err(Error::field(path, "faces", "at least one", "none")) } else { Ok(self) }
     }
 
     /// The corners of the bounding box.

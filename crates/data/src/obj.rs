@@ -63,10 +63,7 @@ pub fn load(path: &Path) -> Result<Mesh> {
         }
         mesh.parts.push(Part { vertices: start..mesh.vertices.len(), texture });
     }
-    if mesh.vertices.is_empty() {
-        return Err(Error::field(path, "faces", "at least one", "none"));
-    }
-    Ok(mesh)
+    mesh.with_faces(path)
 }
 
 /// The text with all vertices first, all indices absolute, and every face left out that refers to what the file does not have:

@@ -16,6 +16,9 @@ pub const GREY: Colour = [200; 3];
 pub const CURVES: [Colour; 7] =
     [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [230, 159, 0], [86, 180, 233], [90, 90, 90]];
 
+/// Colours of x, y and z axes.
+pub const AXES: [Colour; 3] = [[220, 40, 40], [30, 150, 30], [40, 60, 230]];
+
 /// From nothing to much, light to dark: white, yellow, red, black.
 pub const HEAT: [Colour; 4] = [WHITE, [255, 200, 70], [200, 30, 30], [40, 0, 10]];
 /// From near to far, dark to light: the stops of viridis.
@@ -183,7 +186,7 @@ fn ring(image: &mut RgbImage, centre: DVec2, radius: f64, colour: Colour) {
 }
 
 /// Two drawings side by side, from above (x right, y up) and from the front (x right, z up): the sphere of radius 0.5 that holds
-/// the object, and each camera as a dot with its x, y and z axes in red, green and blue.
+/// the object with the world's axes, and each camera as a dot with its own: x red, y green, z blue.
 pub fn cameras(world_from_camera: &[DMat4], side: u32) -> RgbImage {
     let extent = world_from_camera.iter().map(|m| m.w_axis.truncate().abs().max_element()).fold(0.5, f64::max) * 1.2;
     let mut image = blank(2 * side, side);
@@ -196,10 +199,12 @@ pub fn cameras(world_from_camera: &[DMat4], side: u32) -> RgbImage {
             flat + DVec2::new(middle + panel as f64 * f64::from(side), middle)
         };
         ring(&mut image, to_pixel(DVec3::ZERO), 0.5 / extent * middle, GREY);
+        for (axis, colour) in DVec3::AXES.into_iter().zip(AXES) {
+            line(&mut image, to_pixel(DVec3::ZERO), to_pixel(0.5 * axis), colour);
+        }
         for m in world_from_camera {
             let centre = m.w_axis.truncate();
-            let axes = [(m.x_axis, [220, 40, 40]), (m.y_axis, [30, 150, 30]), (m.z_axis, [40, 60, 230])];
-            for (axis, colour) in axes {
+            for (axis, colour) in [m.x_axis, m.y_axis, m.z_axis].into_iter().zip(AXES) {
                 line(&mut image, to_pixel(centre), to_pixel(centre + 0.08 * extent * axis.truncate()), colour);
             }
             ring(&mut image, to_pixel(centre), 1.5, BLACK);

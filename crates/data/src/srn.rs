@@ -1,11 +1,13 @@
 //! The folder layout of the SRN data sets:
 //! `<set>/<instance>/{rgb/*.png, pose/*.txt, intrinsics.txt}`.
 //!
-//! A pose file holds the 4×4 `world_from_camera`, row-major, in any line breaks. `intrinsics.txt` holds
-//! `f cx cy 0.`, the grid's barycentre `0. 0. 0.`, the near plane `1.` and `height width`, in that order.
+//! A pose file holds the 4×4 `world_from_camera`, row-major, in any line breaks, or, with 12 numbers, the first three rows of its
+//! inverse (the object in the camera). `intrinsics.txt` holds `f cx cy 0.`, the grid's barycentre `0. 0. 0.`, the near plane
+//! `1.` and `height width`, in that order; or the nine numbers of a 3×3 matrix, which belong to the pictures as they are. Where
+//! views differ, `intrinsics/NAME.txt` holds those of one view.
 
 use crate::camera::rigid_error;
-use crate::error::{At, Error, Result};
+use crate::error::{At, Error, Result, read_text};
 use crate::pixels::Pixels;
 use glam::DMat4;
 use image::RgbImage;
@@ -49,8 +51,8 @@ pub struct ViewFiles {
 /// The content of `intrinsics.txt`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
-    /// Focal length in pixels, the same along x and y.
-    pub focal: f64,
+    /// Focal length in pixels along x and y.
+    pub focal: [f64; 2],
     /// Principal point `[cx, cy]` in pixels.
     pub centre: [f64; 2],
     /// Image width and height, in pixels, that the values above belong to.
@@ -139,19 +141,23 @@ impl InstanceFiles {
         Ok(Self { name, dir, views })
     }
 
+    /// The file with a view's intrinsics: its own, or that of the instance.
+    pub fn intrinsics_file(&self, view: &str) -> PathBuf {
+        intrinsics_file(&self.dir, view)
+    }
+
     /// Reads the instance's views as squares of `side` pixels.
     pub fn load(&self, side: usize) -> Result<Instance> {
-        let intrinsics = Intrinsics::read(&self.dir.join("intrinsics.txt"))?;
         if self.views.is_empty() {
             return Err(Error::field(&self.dir, "rgb/", "pictures", "none"));
         }
-        let views = self.views.iter().map(|view| view.load(&self.dir, &intrinsics, side)).collect::<Result<_>>()?;
+        let views = self.views.iter().map(|view| view.load(&self.dir, side)).collect::<Result<_>>()?;
         Ok(Instance { name: self.name.clone(), views })
     }
 }
 
 impl ViewFiles {
-    fn load(&self, dir: &Path, intrinsics: &Intrinsics, side: usize) -> Result<LoadedView> {
+    fn load(&self, dir: &Path, side: usize) -> Result<LoadedView> {
         let missing = |folder: &str, extension: &str, other: &Option<PathBuf>| Error::Missing {
             path: dir.join(folder).join(&self.name).with_extension(extension),
             why: format!("{} needs it", other.as_deref().unwrap_or(dir).display()),
@@ -159,10 +165,24 @@ impl ViewFiles {
         let rgb = self.rgb.as_ref().ok_or_else(|| missing("rgb", "png", &self.pose))?;
         let pose = self.pose.as_ref().ok_or_else(|| missing("pose", "txt", &self.rgb))?;
         let world_from_camera = read_pose(pose)?;
-        let (pixels, intrinsics) = load_square(rgb, intrinsics, side)?;
+        let intrinsics = Intrinsics::read(&intrinsics_file(dir, &self.name), picture_size(rgb)?)?;
+        let (pixels, intrinsics) = load_square(rgb, &intrinsics, side)?;
         let world_from_camera = world_from_camera.transpose().to_cols_array();
         Ok(LoadedView { name: self.name.clone(), rgb: pixels.data, world_from_camera, intrinsics })
     }
+}
+
+/// The file with the intrinsics of a view in an instance's folder: its own, or that of all views.
+pub fn intrinsics_file(dir: &Path, view: &str) -> PathBuf {
+    let own = dir.join("intrinsics").join(format!("{view}.txt"));
+    if own.is_file() { own } else { dir.join("intrinsics.txt") }
+}
+
+/// Width and height of a picture, without decoding it.
+pub fn picture_size(path: &Path) -> Result<[usize; 2]> {
+    let reader = image::ImageReader::open(path).at(path)?.with_guessed_format().at(path)?;
+    let (width, height) = reader.into_dimensions().at(path)?;
+    Ok([width as usize, height as usize])
 }
 
 /// Reads one picture as a square of `side` pixels, and the `[fx, fy, cx, cy]` that belong to it: the crop shifts the principal
@@ -175,24 +195,19 @@ pub fn load_square(path: &Path, intrinsics: &Intrinsics, side: usize) -> Result<
         let found = format!("{}×{}", image.width, image.height);
         return Err(Error::field(path, "size", format!("the aspect of intrinsics.txt, {width}×{height}"), found));
     }
-    let scale = image.width as f64 / width as f64;
-    let in_file = Intrinsics {
-        focal: intrinsics.focal * scale,
-        centre: intrinsics.centre.map(|c| c * scale),
-        size: [image.width, image.height],
-    };
-    let Intrinsics { focal, centre: [cx, cy], .. } = in_file.of_square(side);
-    Ok((image.centre_square().area_resample(side, side), [focal, focal, cx, cy].map(|x| x as f32)))
+    let in_file = intrinsics.of_size([image.width, image.height]);
+    let Intrinsics { focal: [fx, fy], centre: [cx, cy], .. } = in_file.of_square(side);
+    Ok((image.centre_square().area_resample(side, side), [fx, fy, cx, cy].map(|x| x as f32)))
 }
 
-/// Reads a pose file: 16 numbers, a rigid `world_from_camera`.
+/// Reads a pose file: 16 numbers, a rigid `world_from_camera`; or 12, three rows of its inverse.
 pub fn read_pose(path: &Path) -> Result<DMat4> {
     rigid(path, "pose", read_pose_unchecked(path)?)
 }
 
 /// Reads a file of poses, one per line as in a pose file; empty lines and those that begin with `#` are left out. At least one.
 pub fn read_poses(path: &Path) -> Result<Vec<DMat4>> {
-    let text = std::fs::read_to_string(path).at(path)?;
+    let text = read_text(path)?;
     let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
     let pose = |(i, line)| {
         let field = format!("line {}", i + 1);
@@ -202,7 +217,8 @@ pub fn read_poses(path: &Path) -> Result<Vec<DMat4>> {
     if poses.is_empty() { Err(Error::field(path, "poses", "at least one line of 16 numbers", "none")) } else { Ok(poses) }
 }
 
-fn rigid(path: &Path, field: &str, pose: DMat4) -> Result<DMat4> {
+/// Refuses what is no rigid motion.
+pub(crate) fn rigid(path: &Path, field: &str, pose: DMat4) -> Result<DMat4> {
     match rigid_error(&pose) {
         error if error <= RIGID_TOLERANCE => Ok(pose),
         error if error >= 2.0 => Err(Error::field(path, field, "a right-handed rotation", "a mirrored or scaled one")),
@@ -212,47 +228,82 @@ fn rigid(path: &Path, field: &str, pose: DMat4) -> Result<DMat4> {
 
 /// Reads a pose file: 16 finite numbers, no more is asked of them.
 pub(crate) fn read_pose_unchecked(path: &Path) -> Result<DMat4> {
-    matrix(path, "pose", &std::fs::read_to_string(path).at(path)?)
+    matrix(path, "pose", &read_text(path)?)
 }
 
-/// 16 finite numbers, row-major.
+/// 16 finite numbers, row-major, or 12 of the inverse.
 fn matrix(path: &Path, field: &str, text: &str) -> Result<DMat4> {
-    let values = numbers(path, field, text)?;
-    let rows: [f64; 16] = values.as_slice().try_into().map_err(|_| Error::field(path, field, "16 numbers", values.len()))?;
-    Ok(DMat4::from_cols_array(&rows).transpose())
+    let mut values = numbers(path, field, text)?;
+    let is_inverse = values.len() == 12;
+    if is_inverse {
+        values.extend([0.0, 0.0, 0.0, 1.0]);
+    }
+    let expected = "16 numbers, or 12 of the inverse";
+    let rows: [f64; 16] = values.as_slice().try_into().map_err(|_| Error::field(path, field, expected, values.len()))?;
+    let matrix = DMat4::from_cols_array(&rows).transpose();
+    Ok(if is_inverse { matrix.inverse() } else { matrix })
 }
 
 fn numbers(path: &Path, field: &str, text: &str) -> Result<Vec<f64>> {
     let number = |word: &str| match word.parse() {
         Ok(x) if f64::is_finite(x) => Ok(x),
-        _ => Err(Error::field(path, field, "finite numbers", format!("\"{word}\""))),
+        _ => Err(Error::field(path, field, "finite numbers", format!("\"{}\"", word.chars().take(40).collect::<String>()))),
     };
     text.split_whitespace().map(number).collect()
 }
 
 impl Intrinsics {
-    /// Reads `intrinsics.txt`.
-    pub fn read(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path).at(path)?;
+    /// Reads `intrinsics.txt`; a file that does not say to which size it belongs is one for `picture`, width and height.
+    pub fn read(path: &Path, picture: [usize; 2]) -> Result<Self> {
+        match Self::parse(path, &read_text(path)?, picture)? {
+            (_, true) => Err(Error::field(path, "world2cam_poses", "0: `sigma-data import` turns such poses round", 1)),
+            (intrinsics, false) => Ok(intrinsics),
+        }
+    }
+
+    /// The content of the file, and whether it says that the poses are inverted.
+    pub(crate) fn parse(path: &Path, text: &str, picture: [usize; 2]) -> Result<(Self, bool)> {
         let lines: Vec<_> = text.lines().filter(|line| !line.trim().is_empty()).collect();
         let line = |i: usize, field: &str, at_least: usize| {
             let values = numbers(path, field, lines.get(i).copied().unwrap_or_default())?;
             let expected = || format!("{at_least} numbers in line {}", i + 1);
             if values.len() < at_least { Err(Error::field(path, field, expected(), values.len())) } else { Ok(values) }
         };
-        let camera = line(0, "f cx cy", 3)?;
-        let size = line(3, "height width", 2)?;
-        if camera[0] <= 0.0 {
-            return Err(Error::field(path, "f", "a positive focal length", camera[0]));
+        let whole = || numbers(path, "3×3 matrix", text).ok().filter(|values| values.len() == 9);
+        let is_matrix = |k: &Vec<f64>| [k[1], k[3], k[6], k[7]] == [0.0; 4] && k[8] == 1.0;
+        let (intrinsics, inverted) = if let Some(k) = whole().filter(is_matrix) {
+            (Self { focal: [k[0], k[4]], centre: [k[2], k[5]], size: picture }, false)
+        } else {
+            let camera = line(0, "f cx cy", 3)?;
+            let size = line(3, "height width", 2)?;
+            if size.iter().any(|&s| !(1.0..=1e6).contains(&s) || s.fract() != 0.0) {
+                return Err(Error::field(path, "height width", "positive whole numbers", format!("{size:?}")));
+            }
+            let size = [size[1] as usize, size[0] as usize];
+            let flag = lines.get(4).is_some_and(|line| line.trim().parse() == Ok(1.0));
+            (Self { focal: [camera[0]; 2], centre: [camera[1], camera[2]], size }, flag)
+        };
+        if let Some(focal) = intrinsics.focal.into_iter().find(|&focal| focal <= 0.0) {
+            return Err(Error::field(path, "f", "a positive focal length", focal));
         }
-        if size.iter().any(|&s| s < 1.0 || s.fract() != 0.0) {
-            return Err(Error::field(path, "height width", "positive whole numbers", format!("{size:?}")));
+        // One of the archives of cars has the values for 512 pixels beside pictures of 128. Cuts have their principal point
+        // anywhere, but not straight beyond the corner.
+        let [x, y] = [0, 1].map(|i| 2.0 * intrinsics.centre[i] / intrinsics.size[i] as f64);
+        if x >= 1.9 && (x / y - 1.0).abs() < 1e-3 && path.file_name() == Some("intrinsics.txt".as_ref()) {
+            let ([cx, cy], [w, h]) = (intrinsics.centre, intrinsics.size);
+            let expected =
+                format!("a point in the picture of {w}×{h}; if all are for {0}×{1}, write so: {1} {0}", 2.0 * cx, 2.0 * cy);
+            return Err(Error::field(path, "cx cy", expected, format!("{cx}, {cy}")));
         }
-        Ok(Self { focal: camera[0], centre: [camera[1], camera[2]], size: [size[1] as usize, size[0] as usize] })
+        Ok((intrinsics, inverted))
     }
-}
 
-impl Intrinsics {
+    /// The same for the whole picture at another size.
+    pub fn of_size(&self, size: [usize; 2]) -> Self {
+        let scale = [0, 1].map(|i| size[i] as f64 / self.size[i] as f64);
+        Self { focal: [0, 1].map(|i| self.focal[i] * scale[i]), centre: [0, 1].map(|i| self.centre[i] * scale[i]), size }
+    }
+
     /// The intrinsics of the centre square, resampled to `side` pixels (see [`load_square`]).
     pub fn of_square(&self, side: usize) -> Self {
         let [width, height] = self.size;
@@ -260,15 +311,19 @@ impl Intrinsics {
         let scale = side as f64 / square as f64;
         let cut = self.size.map(|s| ((s - square) / 2) as f64);
         let centre = [0, 1].map(|i| (self.centre[i] - cut[i]) * scale);
-        Self { focal: self.focal * scale, centre, size: [side, side] }
+        Self { focal: self.focal.map(|focal| focal * scale), centre, size: [side, side] }
     }
 }
 
 impl std::fmt::Display for Intrinsics {
-    /// The text of `intrinsics.txt`.
+    /// The text of `intrinsics.txt`; a matrix where the focal lengths differ, which the other form cannot say.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { focal, centre: [cx, cy], size: [width, height] } = self;
-        writeln!(f, "{focal:?} {cx:?} {cy:?} 0.\n0. 0. 0.\n1.\n{height} {width}")
+        let Self { focal: [fx, fy], centre: [cx, cy], size: [width, height] } = self;
+        if fx == fy {
+            writeln!(f, "{fx:?} {cx:?} {cy:?} 0.\n0. 0. 0.\n1.\n{height} {width}")
+        } else {
+            writeln!(f, "{fx:?} 0. {cx:?}\n0. {fy:?} {cy:?}\n0. 0. 1.")
+        }
     }
 }
 
@@ -279,39 +334,67 @@ pub struct InstanceWriter {
 }
 
 impl InstanceWriter {
-    /// Makes `dir` with its `intrinsics.txt`. If `dir` exists it is refused, or, with `replace`, its pictures and poses are
-    /// removed; files of other kinds stay.
+    /// Makes `dir` with its `intrinsics.txt`. If `dir` exists it is refused, or, with `replace`, its pictures, poses and
+    /// intrinsics are removed; files of other kinds stay.
     pub fn create(dir: impl Into<PathBuf>, intrinsics: &Intrinsics, replace: bool) -> Result<Self> {
+        let writer = Self::bare(dir, replace)?;
+        writer.intrinsics(intrinsics)?;
+        Ok(writer)
+    }
+
+    /// The same without intrinsics.
+    pub(crate) fn bare(dir: impl Into<PathBuf>, replace: bool) -> Result<Self> {
         let dir = dir.into();
         if dir.exists() {
             if !replace {
                 return Err(Error::Exists { path: dir });
             }
-            for view in InstanceFiles::open(dir.clone()).map(|files| files.views).unwrap_or_default() {
-                for path in [view.rgb, view.pose].into_iter().flatten() {
-                    std::fs::remove_file(&path).at(&path)?;
-                }
+            let views = InstanceFiles::open(dir.clone()).map(|files| files.views).unwrap_or_default();
+            let own = |view: &ViewFiles| dir.join("intrinsics").join(format!("{}.txt", view.name));
+            let intrinsics: Vec<_> = views.iter().map(own).chain([dir.join("intrinsics.txt")]).filter(|p| p.exists()).collect();
+            for path in views.into_iter().flat_map(|view| [view.rgb, view.pose]).flatten().chain(intrinsics) {
+                std::fs::remove_file(&path).at(&path)?;
             }
         }
         for folder in ["rgb", "pose"].map(|name| dir.join(name)) {
             std::fs::create_dir_all(&folder).at(&folder)?;
         }
-        let path = dir.join("intrinsics.txt");
-        std::fs::write(&path, intrinsics.to_string()).at(&path)?;
         Ok(Self { dir })
+    }
+
+    /// Writes the intrinsics of all views.
+    pub(crate) fn intrinsics(&self, intrinsics: &Intrinsics) -> Result<()> {
+        let path = self.dir.join("intrinsics.txt");
+        std::fs::write(&path, intrinsics.to_string()).at(&path)
+    }
+
+    /// Writes the intrinsics of one view.
+    pub(crate) fn view_intrinsics(&self, view: &str, intrinsics: &Intrinsics) -> Result<()> {
+        let folder = self.dir.join("intrinsics");
+        std::fs::create_dir_all(&folder).at(&folder)?;
+        let path = folder.join(format!("{view}.txt"));
+        std::fs::write(&path, intrinsics.to_string()).at(&path)
     }
 
     /// Writes `rgb/<name>.png` and `pose/<name>.txt`.
     pub fn add(&self, name: &str, rgb: &RgbImage, world_from_camera: &DMat4) -> Result<()> {
-        let path = self.dir.join("rgb").join(name).with_extension("png");
-        let file = std::io::BufWriter::new(std::fs::File::create(&path).at(&path)?);
-        // The best compression: data sets are written once and kept.
-        let (kind, filter) = (image::codecs::png::CompressionType::Best, image::codecs::png::FilterType::Adaptive);
-        rgb.write_with_encoder(image::codecs::png::PngEncoder::new_with_quality(file, kind, filter)).at(&path)?;
-        let path = self.dir.join("pose").join(name).with_extension("txt");
-        let row = |r: usize| world_from_camera.row(r).to_array().map(|x| format!("{x:.9}")).join(" ");
+        write_png(&self.dir.join("rgb").join(format!("{name}.png")), rgb)?;
+        self.pose(name, world_from_camera)
+    }
+
+    /// Writes `pose/<name>.txt`, every digit of it.
+    pub(crate) fn pose(&self, name: &str, world_from_camera: &DMat4) -> Result<()> {
+        let path = self.dir.join("pose").join(format!("{name}.txt"));
+        let row = |r: usize| world_from_camera.row(r).to_array().map(|x| format!("{x:?}")).join(" ");
         std::fs::write(&path, [0, 1, 2, 3].map(row).join("\n") + "\n").at(&path)
     }
+}
+
+/// Writes a picture with the best compression: data sets are written once and kept.
+pub(crate) fn write_png(path: &Path, rgb: &RgbImage) -> Result<()> {
+    let file = std::io::BufWriter::new(std::fs::File::create(path).at(path)?);
+    let (kind, filter) = (image::codecs::png::CompressionType::Best, image::codecs::png::FilterType::Adaptive);
+    rgb.write_with_encoder(image::codecs::png::PngEncoder::new_with_quality(file, kind, filter)).at(path)
 }
 
 #[cfg(test)]
@@ -320,7 +403,7 @@ mod tests {
     use crate::camera::uniform_sphere;
     use std::fs::write;
 
-    const INTRINSICS: Intrinsics = Intrinsics { focal: 74.4, centre: [4.0, 4.0], size: [8, 8] };
+    const INTRINSICS: Intrinsics = Intrinsics { focal: [74.4; 2], centre: [4.0, 4.0], size: [8, 8] };
 
     /// A set of one instance, its poses and pictures.
     fn made(views: usize) -> (tempfile::TempDir, Vec<DMat4>, Vec<RgbImage>) {
@@ -361,7 +444,7 @@ mod tests {
         let path = dir.path().join("wide.png");
         RgbImage::from_pixel(24, 16, image::Rgb([0, 255, 0])).save(&path).unwrap();
         // The file's values are for twice the picture's size.
-        let intrinsics = Intrinsics { focal: 60.0, centre: [25.0, 14.0], size: [48, 32] };
+        let intrinsics = Intrinsics { focal: [60.0; 2], centre: [25.0, 14.0], size: [48, 32] };
         let (pixels, values) = load_square(&path, &intrinsics, 8).unwrap();
         assert_eq!((pixels.width, pixels.height), (8, 8));
         assert_eq!(values, [15.0, 15.0, (12.5 - 4.0) / 2.0, 3.5]);

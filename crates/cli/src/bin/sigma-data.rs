@@ -1,18 +1,19 @@
-//! `sigma-data`: renders meshes into SRN data sets, and looks into such sets.
+//! `sigma-data`: renders meshes into SRN data sets, converts posed pictures from and to other formats, and looks into them.
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use image::RgbImage;
+use sigma_cli::common::{Result, finish};
+use sigma_cli::data::{Export, Import, Inspect};
 use srn_data::mesh::{Mesh, Up};
 use srn_data::srn::{InstanceWriter, Intrinsics};
-use srn_data::{SrnSet, camera, inspect, ldraw, obj};
+use srn_data::{camera, gltf, ldraw, obj, ply, stl};
 use srn_gpu::raster::{self, Rasterizer};
-use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-type Result<T> = std::result::Result<T, Box<dyn Error>>;
-
 /// Data sets in the SRN folder layout: SET/INSTANCE/{rgb,pose,intrinsics.txt}.
+///
+/// Exit status: 0 done, 1 `inspect` found problems, 2 an error.
 #[derive(Parser)]
 #[command(version, about)]
 struct Cli {
@@ -24,14 +25,18 @@ struct Cli {
 enum Command {
     /// Render meshes to pictures with known cameras, one instance per mesh.
     Render(Render),
-    /// Count, check and draw a data set. Exit status 1 if something is wrong with it.
+    /// Read photographs with known cameras (transforms.json, BOP, COLMAP) or others' SRN folders into a data set.
+    Import(Import),
+    /// Write a data set, or estimated poses, in another format, in the frame and the units that it was imported from.
+    Export(Export),
+    /// Count, check and draw posed pictures. Exit status 1 if something is wrong with them.
     Inspect(Inspect),
 }
 
 #[derive(Args)]
 struct Render {
-    /// Meshes: Wavefront .obj, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The instance is called NAME, or
-    /// like the file.
+    /// Meshes: .obj, .stl, .ply, .gltf, .glb, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The instance is called
+    /// NAME, or like the file.
     #[arg(required = true, value_name = "[NAME=]MESH", value_parser = named_mesh)]
     meshes: Vec<(String, PathBuf)>,
     /// The data set's folder; instances are made inside.
@@ -58,9 +63,9 @@ struct Render {
     /// Angle of view in degrees, instead of --focal.
     #[arg(long, value_parser = |x: &str| between(x, 0.0, 180.0))]
     fov: Option<f64>,
-    /// Which axis points up in .obj files (LDraw has its own).
-    #[arg(long, value_enum, default_value_t = ObjUp::Y)]
-    up: ObjUp,
+    /// Which axis points up in the meshes. Default: y in .obj and glTF, z in .stl and .ply; LDraw has its own.
+    #[arg(long, value_enum)]
+    up: Option<MeshUp>,
     /// Replace instances that exist in the output folder.
     #[arg(long)]
     force: bool,
@@ -78,39 +83,18 @@ enum Cameras {
 }
 
 #[derive(Clone, Copy, ValueEnum)]
-enum ObjUp {
+enum MeshUp {
     Y,
     Z,
 }
 
-#[derive(Args)]
-struct Inspect {
-    /// A data set, or a single instance.
-    dir: PathBuf,
-    /// Print the findings as JSON.
-    #[arg(long)]
-    json: bool,
-    /// Write a contact sheet with a drawing of the cameras to this PNG file.
-    #[arg(long)]
-    out: Option<PathBuf>,
-    /// Overwrite the PNG file.
-    #[arg(long)]
-    force: bool,
-}
-
 fn main() -> ExitCode {
-    let done = match Cli::parse().command {
+    finish(match Cli::parse().command {
         Command::Render(args) => render(&args).map(|()| true),
-        Command::Inspect(args) => inspect(&args),
-    };
-    match done {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::from(1),
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::from(2)
-        }
-    }
+        Command::Import(args) => args.run(),
+        Command::Export(args) => args.run(),
+        Command::Inspect(args) => args.run(),
+    })
 }
 
 fn render(args: &Render) -> Result<()> {
@@ -122,7 +106,7 @@ fn render(args: &Render) -> Result<()> {
     };
     // The SRN convention puts the principal point at side / 2 while integer coordinates are pixel centres.
     let half = side as f64 / 2.0;
-    let intrinsics = Intrinsics { focal, centre: [half, half], size: [side, side] };
+    let intrinsics = Intrinsics { focal: [focal; 2], centre: [half, half], size: [side, side] };
 
     let mut names = std::collections::BTreeSet::new();
     for (name, path) in &args.meshes {
@@ -190,15 +174,21 @@ fn named_mesh(argument: &str) -> std::result::Result<(String, PathBuf), String> 
     }
 }
 
-fn load_mesh(path: &Path, up: ObjUp) -> Result<Mesh> {
+fn load_mesh(path: &Path, up: Option<MeshUp>) -> Result<Mesh> {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    let (mut mesh, up) = match (extension.as_str(), up) {
-        ("dat", _) => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
-        ("obj", ObjUp::Y) => (obj::load(path)?, Up::Y),
-        ("obj", ObjUp::Z) => (obj::load(path)?, Up::Z),
-        _ => return Err(format!("{}: expected a .obj or .dat mesh", path.display()).into()),
+    let (mut mesh, usual) = match extension.as_str() {
+        "dat" => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
+        "obj" => (obj::load(path)?, Up::Y),
+        "gltf" | "glb" => (gltf::load(path)?, Up::Y),
+        "stl" => (stl::load(path)?, Up::Z),
+        "ply" => (ply::load(path)?, Up::Z),
+        _ => return Err(format!("{}: expected a .obj, .stl, .ply, .gltf, .glb or .dat mesh", path.display()).into()),
     };
-    mesh.normalise(up);
+    mesh.normalise(match (usual, up) {
+        (Up::MinusY, _) | (_, None) => usual,
+        (_, Some(MeshUp::Y)) => Up::Y,
+        (_, Some(MeshUp::Z)) => Up::Z,
+    });
     Ok(mesh)
 }
 
@@ -215,30 +205,4 @@ fn upload(rasterizer: &Rasterizer, mesh: &Mesh) -> Result<raster::Model> {
     let textures = mesh.textures.iter().map(|t| raster::Texture { width: t.width(), height: t.height(), rgba: t.as_raw() });
     let textures: Vec<_> = textures.collect();
     Ok(rasterizer.upload(&vertices, &parts, &textures)?)
-}
-
-fn inspect(args: &Inspect) -> Result<bool> {
-    if let Some(out) = args.out.as_ref().filter(|out| out.exists() && !args.force) {
-        return Err(format!("{}: exists already; --force overwrites it", out.display()).into());
-    }
-    let set = SrnSet::open(&args.dir)?;
-    let report = inspect::inspect(&set)?;
-    if args.json {
-        println!("{}", serde_json::to_string_pretty(&report)?);
-    } else {
-        println!("{:<24} {:>6} {:>12} {:>10} {:>15} {:>10}", "instance", "views", "size", "focal px", "distance", "off axis");
-        for i in &report.instances {
-            let sizes = i.sizes.keys().cloned().collect::<Vec<_>>().join(" ");
-            let focal = i.focal_px.map_or("?".into(), |f| format!("{f:.3}"));
-            let radius = i.radius.map_or("?".into(), |[near, far]| format!("{near:.3} … {far:.3}"));
-            println!("{:<24} {:>6} {sizes:>12} {focal:>10} {radius:>15} {:>9.2}°", i.name, i.views, i.off_axis_deg);
-        }
-        let views: usize = report.instances.iter().map(|i| i.views).sum();
-        println!("{} instances, {views} views, {} problems", report.instances.len(), report.problems.len());
-        report.problems.iter().for_each(|problem| println!("problem: {problem}"));
-    }
-    if let Some(out) = &args.out {
-        inspect::contact_sheet(&set, &report, 8, 16).save(out).map_err(|error| format!("{}: {error}", out.display()))?;
-    }
-    Ok(report.problems.is_empty())
 }

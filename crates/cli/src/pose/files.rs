@@ -7,7 +7,7 @@ use glam::DMat4;
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::{Delay, Frame, ImageFormat, RgbImage};
 use sigma_srn::{Intrinsics, Model, write_atomically};
-use srn_data::srn::{self, load_square};
+use srn_data::srn::{self, load_square, picture_size};
 
 use super::positive;
 use crate::common::Result;
@@ -43,11 +43,11 @@ impl CameraArgs {
     /// What the flags say about a picture of `size` pixels, width then height; `None` where there is no flag.
     pub fn intrinsics(&self, size: [usize; 2]) -> Result<Option<srn::Intrinsics>> {
         if let Some(path) = &self.intrinsics {
-            return Ok(Some(srn::Intrinsics::read(path)?));
+            return Ok(Some(srn::Intrinsics::read(path, size)?));
         }
         let [width, height] = size.map(|side| side as f64);
         let focal = self.focal.or_else(|| self.fov.map(|degrees| 0.5 * width / (0.5 * degrees.to_radians()).tan()));
-        Ok(focal.map(|focal| srn::Intrinsics { focal, centre: [width / 2.0, height / 2.0], size }))
+        Ok(focal.map(|focal| srn::Intrinsics { focal: [focal; 2], centre: [width / 2.0, height / 2.0], size }))
     }
 }
 
@@ -111,11 +111,12 @@ impl Picture {
     pub fn open(path: &Path, model: &Model, side: u32, instance: Option<&str>, camera: &CameraArgs) -> Result<Self> {
         let about = |what: &str| format!("{}: {what}", path.display());
         let dir = srn_instance(path);
-        let size = size_of(path)?;
-        let beside = dir.as_ref().map(|dir| dir.join("intrinsics.txt")).filter(|file| file.exists());
+        let size = picture_size(path)?;
+        let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+        let beside = dir.as_ref().map(|dir| srn::intrinsics_file(dir, &stem)).filter(|file| file.exists());
         let intrinsics = match (camera.intrinsics(size)?, beside) {
             (Some(given), _) => given,
-            (None, Some(file)) => srn::Intrinsics::read(&file)?,
+            (None, Some(file)) => srn::Intrinsics::read(&file, size)?,
             (None, None) => return Err(about("no intrinsics: give --focal, --fov or --intrinsics").into()),
         };
         let folder = dir.as_deref().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
@@ -123,7 +124,6 @@ impl Picture {
         let instance = model.instance(&instance)?;
         let (pixels, [fx, fy, cx, cy]) = load_square(path, &intrinsics, side as usize)?;
         let [fx, fy, cx, cy] = [fx, fy, cx, cy].map(f64::from);
-        let stem = path.file_stem().unwrap_or_default().to_string_lossy();
         Ok(Picture {
             name: format!("{}-{stem}", model.instance_name(instance)),
             instance,
@@ -134,19 +134,11 @@ impl Picture {
     }
 }
 
-/// Width and height of a picture.
-fn size_of(path: &Path) -> Result<[usize; 2]> {
-    let about = |error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
-    let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format).map_err(|e| about(&e))?;
-    let (width, height) = reader.into_dimensions().map_err(|e| about(&format!("not a readable image: {e}")))?;
-    Ok([width as usize, height as usize])
-}
-
 /// Side of the pictures that a model takes: as it was trained, or else the shorter side of `picture`.
 pub fn model_side(model: &Model, picture: &Path) -> Result<u32> {
     match model.metadata.side {
         Some(side) => Ok(side),
-        None => Ok(size_of(picture)?.into_iter().min().unwrap_or(0) as u32),
+        None => Ok(picture_size(picture)?.into_iter().min().unwrap_or(0) as u32),
     }
 }
 

@@ -92,11 +92,11 @@ pub fn run(args: &Render) -> Result<bool> {
         None => {
             // The angle of view of the data sets that `sigma-data` makes.
             let focal = fitting_focal_px(trained_side as usize, radius.max(0.51)) * f64::from(side) / f64::from(trained_side);
-            srn::Intrinsics { focal, centre: [f64::from(side) / 2.0; 2], size: [side as usize; 2] }
+            srn::Intrinsics { focal: [focal; 2], centre: [f64::from(side) / 2.0; 2], size: [side as usize; 2] }
         }
     };
-    let srn::Intrinsics { focal, centre: [cx, cy], .. } = files_intrinsics;
-    let intrinsics = Intrinsics { fx: focal, fy: focal, cx, cy, pixel_center: 0.0 };
+    let srn::Intrinsics { focal: [fx, fy], centre: [cx, cy], .. } = files_intrinsics;
+    let intrinsics = Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 };
 
     let engine = args.engine.open()?;
     let views: Vec<_> = poses.iter().map(|&pose| (instance, pose, intrinsics)).collect();

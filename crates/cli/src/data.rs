@@ -1,0 +1,433 @@
+//! `sigma-data import`, `export` and `inspect`: posed pictures in and out, and a look at them.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use glam::{DMat4, DVec3};
+use serde::Deserialize;
+use srn_data::camera::Axes;
+use srn_data::capture::{Bounds, Capture, FrameRecord, UpAxis};
+use srn_data::formats::{self, Format, ReadOptions, WriteOptions, Written, bop};
+use srn_data::inspect::{self, Origin};
+
+use crate::common::{Result, progress};
+
+/// Flags that say what a source is, and how it differs from what its format promises.
+#[derive(Args, Debug)]
+struct Source {
+    /// SRN set or instance, transforms.json or its folder, BOP scene or folder of scenes, COLMAP model or its folder.
+    #[arg(value_name = "SRC")]
+    path: PathBuf,
+    /// srn, transforms, bop or colmap; `auto` looks.
+    #[arg(long, value_name = "FORMAT", default_value = "auto", value_parser = source_format)]
+    format: SourceFormat,
+    /// Axes of the cameras: opencv (x right, y down, z forward), opengl (x right, y up, z back), pytorch3d (x left, y up, z
+    /// forward) or ros (x forward, y left, z up). Default: those of the format.
+    #[arg(long, value_name = "AXES", value_parser = axes)]
+    convention: Option<Axes>,
+    /// The poses are the inverse of what the format says: world to camera where it has camera to world, or the other way.
+    #[arg(long)]
+    inverted: bool,
+    /// Angle of view across the width in degrees, where the source has no intrinsics or wrong ones.
+    #[arg(long, value_name = "DEG", value_parser = angle_of_view)]
+    fov: Option<f64>,
+    /// Folder with masks, white where the object is, named like the pictures. Default: what the source has, and transparency.
+    #[arg(long, value_name = "DIR")]
+    mask: Option<PathBuf>,
+    /// Folder that the pictures' names are relative to. Default: beside the source.
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    /// BOP: only the object of this number.
+    #[arg(long, value_name = "ID")]
+    object: Option<u32>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct SourceFormat(Option<Format>);
+
+fn source_format(text: &str) -> std::result::Result<SourceFormat, String> {
+    if text == "auto" { Ok(SourceFormat(None)) } else { target_format(text).map(|format| SourceFormat(Some(format))) }
+}
+
+fn target_format(text: &str) -> std::result::Result<Format, String> {
+    named(text, &Format::ALL, Format::name)
+}
+
+fn axes(text: &str) -> std::result::Result<Axes, String> {
+    named(text, &Axes::ALL, Axes::name)
+}
+
+fn named<T: Copy>(text: &str, all: &[T], name: fn(T) -> &'static str) -> std::result::Result<T, String> {
+    let names = || all.iter().map(|&one| name(one)).collect::<Vec<_>>().join(", ");
+    all.iter().copied().find(|&one| name(one) == text).ok_or_else(|| format!("expected one of {}", names()))
+}
+
+fn above_zero(text: &str) -> std::result::Result<f64, String> {
+    text.parse().ok().filter(|x: &f64| *x > 0.0 && x.is_finite()).ok_or("expected a number above 0".into())
+}
+
+fn angle_of_view(text: &str) -> std::result::Result<f64, String> {
+    above_zero(text).ok().filter(|&degrees| degrees < 180.0).ok_or("expected a number between 0 and 180".into())
+}
+
+fn share(text: &str) -> std::result::Result<f64, String> {
+    text.parse().ok().filter(|x| (0.0..10.0).contains(x)).ok_or("expected a share, 0 or more".into())
+}
+
+fn point(text: &str) -> std::result::Result<DVec3, String> {
+    let values: Option<Vec<f64>> = text.split(',').map(|word| word.trim().parse().ok().filter(|x: &f64| x.is_finite())).collect();
+    match values.as_deref() {
+        Some(&[x, y, z]) => Ok(DVec3::new(x, y, z)),
+        _ => Err("expected X,Y,Z".into()),
+    }
+}
+
+fn up(text: &str) -> std::result::Result<UpAxis, String> {
+    let (axis, negative) = text.strip_prefix('-').map_or((text, false), |axis| (axis, true));
+    match (["x", "y", "z"].iter().position(|name| *name == axis), text) {
+        (Some(axis), _) => Ok(UpAxis::Axis(axis, negative)),
+        (None, "cameras") => Ok(UpAxis::Cameras),
+        _ => Err("expected x, -x, y, -y, z, -z or cameras".into()),
+    }
+}
+
+impl Source {
+    fn read(&self) -> Result<(Format, Vec<Capture>)> {
+        let format = match self.format.0 {
+            Some(format) => format,
+            None => Format::detect(&self.path)?,
+        };
+        let options = ReadOptions {
+            axes: self.convention,
+            inverted: self.inverted,
+            fov_deg: self.fov,
+            masks: self.mask.clone(),
+            images: self.images.clone(),
+            object: self.object,
+        };
+        Ok((format, formats::read(&self.path, format, &options)?))
+    }
+}
+
+/// Flags of `sigma-data import`.
+#[derive(Args, Debug)]
+pub struct Import {
+    #[command(flatten)]
+    source: Source,
+    /// The data set's folder; instances are made inside.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// The instance's name. Default: that of the source's folder.
+    #[arg(long, value_name = "NAME")]
+    name: Option<String>,
+    /// Cut squares of this many pixels around the object. Default: whole pictures.
+    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    side: Option<u32>,
+    /// Room around the object in a square, on each side, as a share of its extent.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.1, value_parser = share)]
+    margin: f64,
+    /// Centre of the object in the source's units. Default: BOP's box, or where the silhouettes' middles meet.
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, value_parser = point)]
+    centre: Option<DVec3>,
+    /// Diagonal of the object's box in the source's units; becomes 1. Default: BOP's box, or the longest silhouette.
+    #[arg(long, value_name = "LENGTH", value_parser = above_zero)]
+    diagonal: Option<f64>,
+    /// Without --diagonal, a box and silhouettes: the mean distance that the cameras get.
+    #[arg(long, value_name = "R", default_value_t = 1.3, value_parser = above_zero)]
+    radius: f64,
+    /// What is up in the source: x, -x, y, -y, z, -z, or `cameras`, what is up in the pictures. Default: z; COLMAP: cameras.
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true, value_parser = up)]
+    up: Option<UpAxis>,
+    /// Write every N-th view to OUT/test and the others to OUT/train, to train on the ones and measure on the others.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..))]
+    hold_out: Option<u32>,
+    /// Leave frame and units as they are. The default for SRN folders.
+    #[arg(long, conflicts_with_all = ["centre", "diagonal", "up"])]
+    keep_frame: bool,
+    /// Replace instances that exist in the output folder.
+    #[arg(long)]
+    force: bool,
+}
+
+impl Import {
+    /// Runs the command.
+    pub fn run(&self) -> Result<bool> {
+        let (format, mut captures) = self.source.read()?;
+        match (&self.name, &mut captures[..]) {
+            (Some(name), [only]) => only.name = folder_name(name)?,
+            (Some(_), several) => return Err(format!("--name: {} objects cannot have one name", several.len()).into()),
+            _ => {}
+        }
+        let asked = self.centre.is_some() || self.diagonal.is_some() || self.up.is_some();
+        let keep = self.keep_frame || format == Format::Srn && !asked;
+        let options = WriteOptions {
+            axes: None,
+            side: self.side.map(|s| s as usize),
+            placed: !keep || format == Format::Srn,
+            margin: self.margin,
+            replace: self.force,
+        };
+        let folders = if self.hold_out.is_some() { &["train", "test"][..] } else { &[""] };
+        let dirs = captures.iter().flat_map(|capture| folders.iter().map(|folder| self.out.join(folder).join(&capture.name)));
+        refuse_existing(dirs, self.force)?;
+        let bar = progress(captures.len() as u64, "objects");
+        for capture in &mut captures {
+            bar.set_message(capture.name.clone());
+            let (placed, found_by) = if keep { (DMat4::IDENTITY, "kept as it was".into()) } else { self.place(format, capture)? };
+            let root = std::fs::canonicalize(&self.source.path)?;
+            let root = if root.is_file() { root.parent().unwrap_or(&root) } else { &root };
+            let relative = |image: &Path| {
+                let image = std::fs::canonicalize(image).unwrap_or_else(|_| image.into());
+                let inside = image.strip_prefix(root).ok().or(image.file_name().map(Path::new));
+                inside.unwrap_or(&image).to_string_lossy().replace('\\', "/")
+            };
+            // A second import adds to what the first did.
+            let before = capture.record.take();
+            let images = capture.frames.iter().map(|frame| (frame.name.clone(), relative(&frame.image))).collect();
+            let made = FrameRecord {
+                world_from_source: [[0.0; 4]; 4],
+                format: format.name().into(),
+                found_by,
+                object_id: capture.object_id,
+                images,
+            };
+            let total = placed * before.as_ref().map_or(DMat4::IDENTITY, FrameRecord::matrix);
+            let record = FrameRecord { world_from_source: total.transpose().to_cols_array_2d(), ..before.unwrap_or(made) };
+            capture.transform(&placed);
+            for folder in folders {
+                let part = match (self.hold_out, *folder) {
+                    (Some(n), folder) => every(capture, n as usize, folder == "test"),
+                    (None, _) => std::mem::take(capture),
+                };
+                let written = formats::write(&part, Format::Srn, &self.out.join(folder), 1, &options)?;
+                record.write(&written.dir)?;
+                bar.suspend(|| report(&part, &written, &format!("frame: {}", record.found_by)));
+                if written.views == 0 {
+                    return Err(format!("{}: no view could be written", written.dir.display()).into());
+                }
+            }
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        Ok(true)
+    }
+
+    fn place(&self, format: Format, capture: &Capture) -> Result<(DMat4, String)> {
+        let (bounds, how) = capture.find_bounds(self.centre, self.diagonal, self.radius)?;
+        let Bounds { centre: c, diagonal } = bounds;
+        Ok((
+            capture.placement(bounds, self.up.unwrap_or(format.up())),
+            format!("centre {:.4} {:.4} {:.4}, diagonal {diagonal:.4} ({how})", c.x, c.y, c.z),
+        ))
+    }
+}
+
+/// Every n-th view of a capture, or the others. What was skipped is told with the others.
+fn every(capture: &Capture, n: usize, these: bool) -> Capture {
+    let numbered = capture.frames.iter().enumerate().filter(|(i, _)| (i % n == n - 1) == these);
+    let skipped = if these { vec![] } else { capture.skipped.clone() };
+    Capture { frames: numbered.map(|(_, frame)| frame.clone()).collect(), skipped, ..capture.clone() }
+}
+
+/// One line on stdout about what was written; what was left out, on stderr.
+fn report(capture: &Capture, written: &Written, note: &str) {
+    let skipped: Vec<_> = capture.skipped.iter().chain(&written.skipped).collect();
+    skipped.iter().for_each(|why| eprintln!("skipped: {why}"));
+    written.warnings.iter().for_each(|what| eprintln!("warning: {what}"));
+    println!("{}: {} views written, {} skipped; {note}", written.dir.display(), written.views, skipped.len());
+}
+
+fn refuse_existing(mut paths: impl Iterator<Item = PathBuf>, force: bool) -> Result<()> {
+    match paths.find(|path| !force && path.exists()) {
+        Some(path) => Err(format!("{}: exists already; --force replaces it", path.display()).into()),
+        None => Ok(()),
+    }
+}
+
+fn folder_name(name: &str) -> Result<String> {
+    match name {
+        "" | "." | ".." => Err(format!("\"{name}\" cannot name a folder").into()),
+        name if name.contains(['/', '\\']) => Err(format!("\"{name}\" cannot name a folder").into()),
+        name => Ok(name.into()),
+    }
+}
+
+/// Flags of `sigma-data export`.
+#[derive(Args, Debug)]
+pub struct Export {
+    /// A data set or an instance of one; any other source of posed pictures will do, too.
+    #[arg(value_name = "SRC")]
+    path: PathBuf,
+    /// srn, transforms, bop, colmap or colmap-text; or `bop-results`, the CSV of estimates.
+    #[arg(long, value_name = "FORMAT", value_parser = target)]
+    format: Target,
+    /// Folder in which to write; for bop-results, the file.
+    #[arg(long, value_name = "DIR|FILE")]
+    out: PathBuf,
+    /// Axes of the cameras in the output, for srn and transforms: opencv, opengl, pytorch3d or ros. Default: the format's.
+    #[arg(long, value_name = "AXES", value_parser = axes)]
+    convention: Option<Axes>,
+    /// Poses to write in place of those of SRC: what `sigma-pose estimate --json` prints. Views without one are left out.
+    #[arg(long, value_name = "FILE")]
+    poses: Option<PathBuf>,
+    /// Stay in the data set's frame: do not go back to that of the source it was imported from.
+    #[arg(long)]
+    keep_frame: bool,
+    /// bop-results: number of the scene.
+    #[arg(long, value_name = "ID", default_value_t = 1)]
+    scene: u32,
+    /// Write over what is there.
+    #[arg(long)]
+    force: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Target {
+    Format(Format),
+    BopResults,
+}
+
+fn target(text: &str) -> std::result::Result<Target, String> {
+    let refused = |error| format!("{error}, bop-results");
+    if text == "bop-results" { Ok(Target::BopResults) } else { target_format(text).map(Target::Format).map_err(refused) }
+}
+
+/// What is needed of the output of `sigma-pose estimate --json`.
+#[derive(Deserialize)]
+struct Estimates {
+    images: Vec<Estimate>,
+}
+
+#[derive(Deserialize)]
+struct Estimate {
+    image: PathBuf,
+    instance: String,
+    world_from_camera: [[f64; 4]; 4],
+    unexplained: f64,
+    seconds: f64,
+}
+
+impl Export {
+    /// Runs the command.
+    pub fn run(&self) -> Result<bool> {
+        let format = Format::detect(&self.path)?;
+        let mut captures = formats::read(&self.path, format, &ReadOptions::default())?;
+        let estimates = self.poses.as_ref().map(|path| read_estimates(path)).transpose()?;
+        let mut results = vec![];
+        let only = captures.len() == 1;
+        for (i, capture) in captures.iter_mut().enumerate() {
+            let instance = capture.name.clone();
+            let of_view = |name: &str| {
+                // A model may call the only object otherwise.
+                let is_it = |e: &&Estimate| (only || e.instance == instance) && e.image.file_stem() == Some(name.as_ref());
+                estimates.iter().flatten().find(is_it)
+            };
+            // Estimates are in the data set's frame, so they are put in before the frame is left.
+            if estimates.is_some() {
+                capture.frames.retain_mut(|frame| {
+                    let found = of_view(&frame.name);
+                    if let Some(estimate) = found {
+                        frame.camera.world_from_camera = DMat4::from_cols_array_2d(&estimate.world_from_camera).transpose();
+                    }
+                    found.is_some()
+                });
+            }
+            if !self.keep_frame {
+                capture.restore();
+            }
+            let object = capture.object_id.unwrap_or(i as u32 + 1);
+            for (k, frame) in capture.frames.iter().enumerate() {
+                let estimate = of_view(&frame.name);
+                results.push(bop::Estimate {
+                    scene_id: self.scene,
+                    im_id: frame.name.split('_').next().and_then(|name| name.parse().ok()).unwrap_or(k as u32),
+                    obj_id: object,
+                    score: estimate.map_or(1.0, |estimate| 1.0 - estimate.unexplained),
+                    camera_from_object: frame.camera.world_from_camera.inverse(),
+                    time: estimate.map_or(-1.0, |estimate| estimate.seconds),
+                });
+            }
+        }
+        captures.retain(|capture| !capture.frames.is_empty());
+        if captures.is_empty() {
+            return Err(format!("{}: no view of {} has a pose there", self.path.display(), show(self.poses.as_deref())).into());
+        }
+        let Target::Format(format) = self.format else {
+            refuse_existing([self.out.clone()].into_iter(), self.force)?;
+            bop::write_results(&self.out, &results, self.force)?;
+            println!("{}: {} estimates", self.out.display(), results.len());
+            return Ok(true);
+        };
+        let options = WriteOptions { axes: self.convention, replace: self.force, ..WriteOptions::default() };
+        for (i, capture) in captures.iter().enumerate() {
+            let written = formats::write(capture, format, &self.out, i as u32 + 1, &options)?;
+            report(capture, &written, &capture.name);
+        }
+        Ok(true)
+    }
+}
+
+fn show(path: Option<&Path>) -> String {
+    path.unwrap_or(Path::new("the source")).display().to_string()
+}
+
+fn read_estimates(path: &Path) -> Result<Vec<Estimate>> {
+    let about = |error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
+    let text = std::fs::read_to_string(path).map_err(|error| about(&error))?;
+    let estimates: Estimates = serde_json::from_str(&text).map_err(|error| about(&error))?;
+    Ok(estimates.images)
+}
+
+/// Flags of `sigma-data inspect`.
+#[derive(Args, Debug)]
+pub struct Inspect {
+    #[command(flatten)]
+    source: Source,
+    /// Print the findings as JSON.
+    #[arg(long)]
+    json: bool,
+    /// Write a contact sheet with the axes and a drawing of the cameras to this PNG file.
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Overwrite the PNG file.
+    #[arg(long)]
+    force: bool,
+}
+
+impl Inspect {
+    /// Runs the command; false where something is wrong.
+    pub fn run(&self) -> Result<bool> {
+        refuse_existing(self.out.iter().cloned(), self.force)?;
+        let (format, mut captures) = self.source.read()?;
+        let origin = if format == Format::Srn { Origin::Given } else { Origin::Found };
+        if origin == Origin::Found {
+            inspect::place_all(&mut captures, format.up())?;
+        }
+        let report = inspect::inspect(&captures, self.source.convention.unwrap_or(format.axes()), origin);
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&report)?);
+        } else {
+            let head = ["instance", "views", "size", "focal px", "distance", "off axis", "facing"];
+            println!(
+                "{:<24} {:>6} {:>12} {:>17} {:>15} {:>9} {:>6}",
+                head[0], head[1], head[2], head[3], head[4], head[5], head[6]
+            );
+            for i in &report.instances {
+                let sizes = i.sizes.keys().cloned().collect::<Vec<_>>().join(" ");
+                let range = |[low, high]: [f64; 2]| {
+                    if high - low < 1e-6 * high { format!("{low:.3}") } else { format!("{low:.3} … {high:.3}") }
+                };
+                let (focal, radius, off) = (range(i.focal_px), range(i.radius), i.off_axis_deg);
+                println!("{:<24} {:>6} {sizes:>12} {focal:>17} {radius:>15} {off:>8.2}° {:>6}", i.name, i.views, i.facing);
+            }
+            let views: usize = report.instances.iter().map(|i| i.views).sum();
+            println!("{} instances, {views} views, {} problems", report.instances.len(), report.problems.len());
+            report.problems.iter().for_each(|problem| println!("problem: {problem}"));
+            report.notes.iter().for_each(|note| println!("note: {note}"));
+        }
+        if let Some(out) = &self.out {
+            inspect::contact_sheet(&captures, 8, 16).save(out).map_err(|error| format!("{}: {error}", out.display()))?;
+        }
+        Ok(report.problems.is_empty())
+    }
+}
