@@ -51,13 +51,13 @@ pub struct Options {
 
 impl Default for Options {
     /// Levenberg–Marquardt: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the
-    /// best one on all.
+    /// best two on all: the loss has small minima side by side.
     fn default() -> Self {
         let phases = vec![
             Phase { steps: 0, stride: 4, keep: usize::MAX },
             Phase { steps: 8, stride: 4, keep: 16 },
-            Phase { steps: 8, stride: 2, keep: 4 },
-            Phase { steps: 8, stride: 1, keep: 1 },
+            Phase { steps: 10, stride: 2, keep: 4 },
+            Phase { steps: 10, stride: 1, keep: 2 },
         ];
         Options { method: Method::LevenbergMarquardt { soft: 0.3 }, phases, seed: 0 }
     }
