@@ -16,6 +16,11 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_vec4", "+ 1e-5", "+ 1e-2"),
         ("forward_vec4", "params.features / 4u;", "params.features / 8u;"),
         ("forward_vec4", "f32(params.features);", "f32(n);"),
+        ("forward_subgroup", "+ 1e-5", "+ 1e-2"),
+        ("forward_subgroup", "within(c5, x5 - mean)", "x5 - mean"),
+        ("forward_subgroup", "4u, n > 16u", "2u, n > 16u"),
+        ("forward_subgroup", "subgroupShuffleXor(sum, 4u)", "subgroupShuffleXor(sum, 2u)"),
+        ("forward_subgroup", "row < params.rows && column == 0u", "row <= params.rows && column == 0u && row != 1u"),
     ],
 };
 
@@ -31,6 +36,10 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
         ("backward_input_vec4", "- mean_e", "+ mean_e"),
         ("backward_input_vec4", "dot(along, vec4(1.0))", "dot(along, vec4(1.0, 1.0, 1.0, 0.0))"),
         ("backward_input_vec4", "params.features / 4u + j", "params.features / 2u + j"),
+        ("backward_input_subgroup", "- mean_e", "+ mean_e"),
+        ("backward_input_subgroup", "passes & vec4(column < params.features / 4u)", "passes"),
+        ("backward_input_subgroup", "step = 8u / lanes", "step = 8u"),
+        ("backward_input_subgroup", "e6 * x6", "e6"),
     ],
 };
 
@@ -62,9 +71,19 @@ fn backward_affine_matches_reference() {
 }
 
 fn cases() -> Vec<Case> {
-    [(1, 3, false), (7, 17, true), (129, 30, false), (300, 5, true), (1, 4, true), (129, 64, true), (300, 8, false)]
-        .map(|(rows, features, accumulate)| case(rows, features, accumulate))
-        .into()
+    let odd = [(1, 3, false), (7, 17, true), (129, 30, false), (300, 5, true)];
+    // One, two, four and eight lanes to a row, and a row too long for them.
+    let even = [
+        (1, 4, true),
+        (300, 8, false),
+        (129, 36, true),
+        (65, 64, true),
+        (258, 100, false),
+        (33, 228, true),
+        (9, 256, false),
+        (5, 260, true),
+    ];
+    odd.into_iter().chain(even).map(|(rows, features, accumulate)| case(rows, features, accumulate)).collect()
 }
 
 /// Forward and both ways back: these need the statistics.

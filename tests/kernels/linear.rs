@@ -13,8 +13,8 @@ pub static FORWARD: KernelTest = KernelTest {
     faults: &[
         ("forward", "* params.weight_stride", "* 0u"),
         ("forward", "slots[params.first_group + group]", "slots[group]"),
-        ("forward", "tile[r] + bias", "tile[r]"),
-        ("forward", "i + lane < vec4(n)", "i + lane <= vec4(n)"),
+        ("forward", "var y2 = bias", "var y2 = vec4(0.0)"),
+        ("forward", "row + 7u, out, y7", "row + 7u, out, y6"),
         ("forward", "accumulate == 1u", "accumulate == 0u"),
         ("forward", "min(params.out_features - out, 4u)", "min(params.out_features - out, 3u)"),
         ("forward_vec4", "slots[params.first_group + group]", "slots[group]"),
@@ -22,6 +22,13 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_vec4", "y_ab += wb * xa", "y_ab += wa * xa"),
         ("forward_vec4", "row + 4u, out + 4u, y_bb", "row + 4u, out + 4u, y_ba"),
         ("forward_vec4", "accumulate == 1u", "accumulate == 0u"),
+        ("forward_subgroup", "slots[params.first_group + group]", "slots[group]"),
+        ("forward_subgroup", "subgroupShuffle(mine, first + 3u)", "subgroupShuffle(mine, first + 2u)"),
+        ("forward_subgroup", "multiply_add(&y_2b, wb, x2", "multiply_add(&y_2b, wb, x1"),
+        ("forward_subgroup", "row + 24u, out_b", "row + 16u, out_b"),
+        ("forward_subgroup", "row >= params.rows_per_group || out", "row > params.rows_per_group || out"),
+        ("forward_subgroup", "sum.r5 + bias", "sum.r5"),
+        ("forward_subgroup", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 
@@ -32,14 +39,25 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
     cases: backward_input,
     faults: &[
         ("backward_input", "o = params.first_out", "o = 0u"),
-        ("backward_input", "o + lane < vec4(params.end_out)", "o + lane <= vec4(params.end_out)"),
-        ("backward_input", "* inside.w", "* inside.z"),
+        ("backward_input", "o < params.end_out", "o < params.out_features"),
+        ("backward_input", "x5 += w * d_y[y_b.y", "x5 += w * d_y[y_b.x"),
         ("backward_input", "slots[params.first_group + group]", "slots[group]"),
         ("backward_input", "accumulate == 1u", "accumulate == 0u"),
         ("backward_input_vec4", "o = params.first_out", "o = 0u"),
         ("backward_input_vec4", "x_ba += wa * yb", "x_ba += wb * yb"),
         ("backward_input_vec4", "weights[at + 3u * stride]", "weights[at + 2u * stride]"),
         ("backward_input_vec4", "accumulate == 1u", "accumulate == 0u"),
+        ("backward_input_subgroup", "o = params.first_out", "o = 0u"),
+        ("backward_input_subgroup", "slots[params.first_group + group]", "slots[group]"),
+        ("backward_input_subgroup", "subgroupShuffle(mine, first + 7u)", "subgroupShuffle(mine, first + 6u)"),
+        ("backward_input_subgroup", "weights[at + 3u * stride]", "weights[at + 2u * stride]"),
+        ("backward_input_subgroup", "row + member + vec4(0u, 8u,", "row + member + vec4(0u, 9u,"),
+        (
+            "backward_input_subgroup",
+            "team = (subgroup * subgroup_size + lane) / 8u",
+            "team = 0u * (subgroup * subgroup_size + lane)",
+        ),
+        ("backward_input_subgroup", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 
@@ -59,6 +77,13 @@ pub static BACKWARD_WEIGHT: KernelTest = KernelTest {
         ("backward_weight_vec4", "w_ba += xa * transpose(yb)", "w_ba += xa * transpose(ya)"),
         ("backward_weight_vec4", "bias_b += yb", "bias_b += ya"),
         ("backward_weight_vec4", "accumulate == 1u", "accumulate == 0u"),
+        ("backward_weight_subgroup", "r + four < vec4(end)", "r + four <= vec4(end)"),
+        ("backward_weight_subgroup", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
+        ("backward_weight_subgroup", "subgroupShuffle(mine, first + 4u)", "subgroupShuffle(mine, first + 5u)"),
+        ("backward_weight_subgroup", "32u * (team % 4u)", "32u * (team % 2u)"),
+        ("backward_weight_subgroup", "bias += vec4(1.0)", "bias += vec4(0.5)"),
+        ("backward_weight_subgroup", "out + 3u, in_b, w_3b", "out + 3u, in_b, w_3a"),
+        ("backward_weight_subgroup", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 

@@ -23,7 +23,7 @@ pub(crate) struct Pipeline {
 
 impl Pipeline {
     pub fn new(gpu: &Gpu, kernel: &Kernel, variant: &Variant, text: &str) -> Result<Self, ExecutorError> {
-        let label = format!("{}/{}", kernel.op, variant.name);
+        let label = kernel.label(variant);
         tracing::debug!(kernel = label, "compile");
         let slots = reflect(kernel, text).map_err(|what| ExecutorError::Device { what: format!("{label}: {what}") })?;
         let entries: Vec<_> = slots

@@ -1,0 +1,186 @@
+//! Which variant of its kernel a step runs: measured once for a device, a text and a shape, then kept in a file.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::time::SystemTime;
+use std::{env, fs, io};
+
+use srn_plan::{ExecutorError, Step};
+use srn_shaders::{Requirement, Variant};
+
+use crate::Gpu;
+use crate::executor::Launch;
+use crate::gpu::lock;
+
+/// How the variants of kernels are chosen.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Choice {
+    /// The fastest one: measured when a plan first needs it, on buffers of the measurement's own, and kept.
+    ///
+    /// Variants add in different orders, so results repeat bit for bit as long as the choice does. The file sees to that
+    /// from one process to the next; without one, each device that is opened measures anew.
+    Measured {
+        /// The folder of the file `variants.txt`. One that cannot be read or written is as good as none.
+        cache: Option<PathBuf>,
+    },
+    /// The variant of this name where a kernel has it and size and device allow it, else the plain form: for tests.
+    Named(String),
+}
+
+impl Default for Choice {
+    /// Measured, and kept in `sigma-srn` of the user's cache directory: `$XDG_CACHE_HOME`, `%LOCALAPPDATA%` or `~/.cache`.
+    fn default() -> Self {
+        let set = |name| env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+        let base = set("XDG_CACHE_HOME").or_else(|| set("LOCALAPPDATA")).or_else(|| Some(set("HOME")?.join(".cache")));
+        Choice::Measured { cache: base.map(|base| base.join("sigma-srn")) }
+    }
+}
+
+/// The choice, and what it has been so far.
+#[derive(Debug, Default)]
+pub(crate) struct Chooser {
+    choice: Choice,
+    known: Mutex<Known>,
+}
+
+/// `op/variant` by what it was measured for.
+type Known = BTreeMap<String, String>;
+
+impl Chooser {
+    pub fn new(choice: Choice) -> Self {
+        Chooser { choice, known: Mutex::default() }
+    }
+
+    /// The variant for a step; `launch` makes the step with a variant and a part of its extent ready to be timed.
+    pub fn choose(
+        &self,
+        gpu: &Gpu,
+        step: &Step,
+        launch: impl Fn(&Variant, [u32; 3]) -> Result<Launch, ExecutorError>,
+    ) -> Result<&'static Variant, ExecutorError> {
+        let usable: Vec<&'static Variant> = step.kernel.variants.iter().filter(|variant| is_usable(variant, step, gpu)).collect();
+        let named = |label: &str| usable.iter().copied().find(|variant| label == step.kernel.label(variant));
+        let cache = match &self.choice {
+            _ if usable.len() == 1 => return Ok(usable[0]),
+            Choice::Named(name) => return Ok(named(&format!("{}/{name}", step.kernel.op)).unwrap_or(usable[0])),
+            Choice::Measured { cache } => cache.as_deref(),
+        };
+        let key = key(gpu, step, &usable);
+        // Held while measuring: two plans that are built at once would spoil each other's times.
+        let mut known = lock(&self.known);
+        if known.is_empty() {
+            *known = cache.and_then(|folder| read(folder).ok()).unwrap_or_default();
+        }
+        if let Some(variant) = known.get(&key).and_then(|label| named(label)) {
+            return Ok(variant);
+        }
+        let fastest = measure(gpu, step, &usable, launch)?;
+        // What another process has chosen meanwhile holds for both.
+        known.extend(cache.and_then(|folder| read(folder).ok()).unwrap_or_default());
+        let variant = known.get(&key).and_then(|label| named(label)).unwrap_or(fastest);
+        known.insert(key, step.kernel.label(variant));
+        if let Some(Err(error)) = cache.map(|folder| write(folder, &known)) {
+            tracing::debug!(%error, ?cache, "the choice cannot be kept");
+        }
+        Ok(variant)
+    }
+}
+
+fn is_usable(variant: &Variant, step: &Step, gpu: &Gpu) -> bool {
+    variant.requires.iter().all(|requirement| match requirement {
+        Requirement::FeaturesMultipleOf4 => widths(step).all(|width| width % 4 == 0),
+        Requirement::FeaturesAtMost256 => widths(step).all(|width| width <= 256),
+        Requirement::Subgroups => gpu.has_subgroups(),
+    })
+}
+
+/// The parameters of a step that are numbers of features.
+fn widths(step: &Step) -> impl Iterator<Item = u32> {
+    let names = ["features", "in_features", "out_features", "first_out", "end_out"];
+    let fields = step.kernel.params.fields.iter().filter(move |field| names.contains(&field.0));
+    fields.map(|&(_, _, offset)| bytemuck::pod_read_unaligned(&step.params[offset..offset + 4]))
+}
+
+/// What a measurement holds for: the device, the texts, the widths, and the extent up to the next power of two.
+fn key(gpu: &Gpu, step: &Step, usable: &[&Variant]) -> String {
+    let texts: Vec<String> = usable.iter().map(|variant| gpu.source(step.kernel, variant)).collect();
+    let shape: Vec<u32> = widths(step).chain(step.extent.map(u32::next_power_of_two)).collect();
+    let hash = fnv(format!("{} {} {texts:?} {shape:?}", gpu.adapter(), step.kernel.name).as_bytes());
+    format!("{hash:016x}")
+}
+
+/// Fowler, Noll and Vo's hash 1a: the standard library's may change with its version.
+fn fnv(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3))
+}
+
+/// Work that a software adapter is timed on, in floating-point operations; a real GPU, which needs many rows to show
+/// what it can, is timed on the whole.
+const SAMPLE: u64 = 200_000_000;
+const ROUNDS: usize = 5;
+
+fn measure(
+    gpu: &Gpu,
+    step: &Step,
+    usable: &[&'static Variant],
+    launch: impl Fn(&Variant, [u32; 3]) -> Result<Launch, ExecutorError>,
+) -> Result<&'static Variant, ExecutorError> {
+    let (mut extent, mut flops) = (step.extent, step.flops);
+    while gpu.adapter().is_software && flops > SAMPLE {
+        // The rows of a group, or the groups; both for sums over rows.
+        let longest = if extent[0] >= extent[2] { 0 } else { 2 };
+        extent[longest] = extent[longest].div_ceil(2);
+        flops /= 2;
+    }
+    let mut tried = Vec::new();
+    for &variant in usable {
+        match launch(variant, extent) {
+            Ok(launch) => tried.push((f64::INFINITY, variant, launch)),
+            Err(error) => tracing::debug!(%error, "not a candidate"),
+        }
+    }
+    // The first round compiles. Then the slow ones drop out, the later the closer: other programs disturb single rounds.
+    for round in 0..=ROUNDS {
+        let best = tried.iter().map(|candidate| candidate.0).fold(f64::INFINITY, f64::min);
+        let chance = 1.0 + 4.0 / round as f64;
+        let near: Vec<usize> = (0..tried.len()).filter(|&index| tried[index].0 <= chance * best).collect();
+        if near.len() <= 1 {
+            break;
+        }
+        let launches: Vec<&Launch> = near.iter().map(|&index| &tried[index].2).collect();
+        for (index, seconds) in near.into_iter().zip(gpu.time(&launches)?) {
+            if round > 0 {
+                tried[index].0 = seconds.min(tried[index].0);
+            }
+        }
+    }
+    let fastest = tried.iter().min_by(|a, b| a.0.total_cmp(&b.0));
+    let times: Vec<String> =
+        tried.iter().map(|(seconds, variant, _)| format!("{} {:.3} ms", variant.name, 1e3 * seconds)).collect();
+    let fastest = fastest.map_or(usable[0], |candidate| candidate.1);
+    tracing::debug!(
+        kernel = step.kernel.name,
+        widths = ?widths(step).collect::<Vec<_>>(),
+        extent = ?step.extent,
+        "chose {}: {}", fastest.name, times.join(", ")
+    );
+    Ok(fastest)
+}
+
+/// Lines of a key and a label; others are left out.
+fn read(folder: &Path) -> io::Result<Known> {
+    let text = fs::read_to_string(folder.join("variants.txt"))?;
+    let lines = text.lines().filter_map(|line| line.split_once(' '));
+    Ok(lines.map(|(key, label)| (key.to_owned(), label.to_owned())).collect())
+}
+
+/// Whole or not at all: another process may be reading.
+fn write(folder: &Path, known: &Known) -> io::Result<()> {
+    fs::create_dir_all(folder)?;
+    let lines: String = known.iter().map(|(key, label)| format!("{key} {label}\n")).collect();
+    let nanoseconds = SystemTime::UNIX_EPOCH.elapsed().map_or(0, |time| time.as_nanos());
+    let new = folder.join(format!("variants.{}.{nanoseconds}", std::process::id()));
+    fs::write(&new, lines)?;
+    fs::rename(&new, folder.join("variants.txt")).inspect_err(|_| drop(fs::remove_file(&new)))
+}
