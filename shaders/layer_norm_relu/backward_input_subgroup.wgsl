@@ -1,5 +1,5 @@
 // e = gamma d_y where y > 0, else 0; x̂ = (x - mean) rstd; d_x = rstd (e - mean(e) - x̂ mean(e x̂)), means over the features.
-// One invocation holds up to eight vectors of a row in registers, which is read once; the lanes of a row add up their sums. At most 32 rows.
+// One invocation holds eight vectors of one or more rows in registers, so that they are read once; eight lanes add up what belongs to one. 32 rows in turn.
 // x, d_y [rows, features], stats [rows, 2] = (mean, rstd), affine [2, features] = (gamma, beta) → d_x [rows, features]; features a multiple of 4, at most 256.
 // OVERWRITES d_x.
 
@@ -17,15 +17,30 @@ struct Params {
 @group(0) @binding(4) var<storage, read> d_y: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> d_x: array<vec4<f32>>;
 
-// The sum over the lanes of a row, 1, 2, 4 or 8 of them, which all get it.
-fn total(mine: vec4<f32>, lanes: u32) -> f32 {
-    var sum = dot(mine, vec4(1.0));
-    let one = sum + subgroupShuffleXor(sum, 1u);
-    sum = select(sum, one, lanes > 1u);
-    let two = sum + subgroupShuffleXor(sum, 2u);
-    sum = select(sum, two, lanes > 2u);
-    let four = sum + subgroupShuffleXor(sum, 4u);
-    return select(sum, four, lanes > 4u);
+// A number for each of a lane's eight vectors.
+struct Slots {
+    a: vec4<f32>,
+    b: vec4<f32>,
+}
+
+// Sums over the vectors of a row, 1, 2, 4 or 8 successive ones of each of eight lanes; all of them get their row's sum.
+fn total(mine: Slots, per_row: u32) -> Slots {
+    var a = mine.a;
+    var b = mine.b;
+    a = select(a, a + a.yxwz, per_row > 1u);
+    b = select(b, b + b.yxwz, per_row > 1u);
+    a = select(a, a + a.zwxy, per_row > 2u);
+    b = select(b, b + b.zwxy, per_row > 2u);
+    let both = a + b;
+    a = select(a, both, per_row > 4u);
+    b = select(b, both, per_row > 4u);
+    a += subgroupShuffleXor(a, 1u);
+    b += subgroupShuffleXor(b, 1u);
+    a += subgroupShuffleXor(a, 2u);
+    b += subgroupShuffleXor(b, 2u);
+    a += subgroupShuffleXor(a, 4u);
+    b += subgroupShuffleXor(b, 4u);
+    return Slots(a, b);
 }
 
 // The gradient to the normalised values; zero beyond the row.
@@ -48,21 +63,20 @@ fn main(
     @builtin(subgroup_size) subgroup_size: u32,
     @builtin(subgroup_invocation_id) lane: u32,
 ) {
-    // As few lanes to a row as hold it in eight vectors each; eight lanes of a subgroup do 32 rows, whatever its size.
+    // Eight lanes of a subgroup do 32 rows, whatever its size: 1, 2, 4 or 8 vectors of each make a row.
     let n = params.features / 4u;
-    let lanes = select(select(select(1u, 2u, n > 8u), 4u, n > 16u), 8u, n > 32u);
+    let per_row = select(select(select(1u, 2u, n > 8u), 4u, n > 16u), 8u, n > 32u);
     let team = (subgroup * subgroup_size + lane) / 8u;
-    let first = 32u * (8u * (workgroup.y * workgroups.x + workgroup.x) + team) + lane % 8u / lanes;
-    let column = lane % lanes;
-    // Columns of this lane; the last one stands in for those beyond the row, which count as zero and are not stored.
-    let c0 = column;
-    let c1 = column + 1u * lanes;
-    let c2 = column + 2u * lanes;
-    let c3 = column + 3u * lanes;
-    let c4 = column + 4u * lanes;
-    let c5 = column + 5u * lanes;
-    let c6 = column + 6u * lanes;
-    let c7 = column + 7u * lanes;
+    let first = 32u * (8u * (workgroup.y * workgroups.x + workgroup.x) + team);
+    // Columns of the vectors; the last one stands in for those beyond the row, which count as zero and are not stored.
+    let c0 = lane % 8u;
+    let c1 = lane % 8u + 8u * (1u % per_row);
+    let c2 = lane % 8u + 8u * (2u % per_row);
+    let c3 = lane % 8u + 8u * (3u % per_row);
+    let c4 = lane % 8u + 8u * (4u % per_row);
+    let c5 = lane % 8u + 8u * (5u % per_row);
+    let c6 = lane % 8u + 8u * (6u % per_row);
+    let c7 = lane % 8u + 8u * (7u % per_row);
     let j0 = min(c0, n - 1u);
     let j1 = min(c1, n - 1u);
     let j2 = min(c2, n - 1u);
@@ -87,40 +101,70 @@ fn main(
     let beta5 = affine[n + j5];
     let beta6 = affine[n + j6];
     let beta7 = affine[n + j7];
-    let step = 8u / lanes;
-    for (var k = 0u; k < 32u; k += step) {
-        let row = first + k;
-        // Every lane adds up with its neighbours, also where no row is left.
-        let at = min(row, params.rows - 1u) * n;
-        let mean = stats[2u * min(row, params.rows - 1u)];
-        let rstd = stats[2u * min(row, params.rows - 1u) + 1u];
-        let x0 = (x[at + j0] - mean) * rstd;
-        let x1 = (x[at + j1] - mean) * rstd;
-        let x2 = (x[at + j2] - mean) * rstd;
-        let x3 = (x[at + j3] - mean) * rstd;
-        let x4 = (x[at + j4] - mean) * rstd;
-        let x5 = (x[at + j5] - mean) * rstd;
-        let x6 = (x[at + j6] - mean) * rstd;
-        let x7 = (x[at + j7] - mean) * rstd;
-        let e0 = d_normalised(c0, x0, gamma0, beta0, d_y[at + j0]);
-        let e1 = d_normalised(c1, x1, gamma1, beta1, d_y[at + j1]);
-        let e2 = d_normalised(c2, x2, gamma2, beta2, d_y[at + j2]);
-        let e3 = d_normalised(c3, x3, gamma3, beta3, d_y[at + j3]);
-        let e4 = d_normalised(c4, x4, gamma4, beta4, d_y[at + j4]);
-        let e5 = d_normalised(c5, x5, gamma5, beta5, d_y[at + j5]);
-        let e6 = d_normalised(c6, x6, gamma6, beta6, d_y[at + j6]);
-        let e7 = d_normalised(c7, x7, gamma7, beta7, d_y[at + j7]);
-        let sum = e0 + e1 + e2 + e3 + e4 + e5 + e6 + e7;
-        let along = e0 * x0 + e1 * x1 + e2 * x2 + e3 * x3 + e4 * x4 + e5 * x5 + e6 * x6 + e7 * x7;
-        let mean_e = total(sum, lanes) / f32(params.features);
-        let mean_along = total(along, lanes) / f32(params.features);
-        put(row, c0, rstd * (e0 - mean_e - x0 * mean_along));
-        put(row, c1, rstd * (e1 - mean_e - x1 * mean_along));
-        put(row, c2, rstd * (e2 - mean_e - x2 * mean_along));
-        put(row, c3, rstd * (e3 - mean_e - x3 * mean_along));
-        put(row, c4, rstd * (e4 - mean_e - x4 * mean_along));
-        put(row, c5, rstd * (e5 - mean_e - x5 * mean_along));
-        put(row, c6, rstd * (e6 - mean_e - x6 * mean_along));
-        put(row, c7, rstd * (e7 - mean_e - x7 * mean_along));
+    let octet = lane - lane % 8u;
+    let last = params.rows - 1u;
+    for (var row = first; row < min(first + 32u, params.rows); row += 8u / per_row) {
+        let r0 = row;
+        let r1 = row + 1u / per_row;
+        let r2 = row + 2u / per_row;
+        let r3 = row + 3u / per_row;
+        let r4 = row + 4u / per_row;
+        let r5 = row + 5u / per_row;
+        let r6 = row + 6u / per_row;
+        let r7 = row + 7u / per_row;
+        // Each lane loads what belongs to one row.
+        let mine = min(row + lane % 8u, last);
+        let mean_of_mine = stats[2u * mine];
+        let rstd_of_mine = stats[2u * mine + 1u];
+        let mean0 = subgroupShuffle(mean_of_mine, octet);
+        let rstd0 = subgroupShuffle(rstd_of_mine, octet);
+        let mean1 = subgroupShuffle(mean_of_mine, octet + 1u / per_row);
+        let rstd1 = subgroupShuffle(rstd_of_mine, octet + 1u / per_row);
+        let mean2 = subgroupShuffle(mean_of_mine, octet + 2u / per_row);
+        let rstd2 = subgroupShuffle(rstd_of_mine, octet + 2u / per_row);
+        let mean3 = subgroupShuffle(mean_of_mine, octet + 3u / per_row);
+        let rstd3 = subgroupShuffle(rstd_of_mine, octet + 3u / per_row);
+        let mean4 = subgroupShuffle(mean_of_mine, octet + 4u / per_row);
+        let rstd4 = subgroupShuffle(rstd_of_mine, octet + 4u / per_row);
+        let mean5 = subgroupShuffle(mean_of_mine, octet + 5u / per_row);
+        let rstd5 = subgroupShuffle(rstd_of_mine, octet + 5u / per_row);
+        let mean6 = subgroupShuffle(mean_of_mine, octet + 6u / per_row);
+        let rstd6 = subgroupShuffle(rstd_of_mine, octet + 6u / per_row);
+        let mean7 = subgroupShuffle(mean_of_mine, octet + 7u / per_row);
+        let rstd7 = subgroupShuffle(rstd_of_mine, octet + 7u / per_row);
+        let x0 = (x[min(r0, last) * n + j0] - mean0) * rstd0;
+        let x1 = (x[min(r1, last) * n + j1] - mean1) * rstd1;
+        let x2 = (x[min(r2, last) * n + j2] - mean2) * rstd2;
+        let x3 = (x[min(r3, last) * n + j3] - mean3) * rstd3;
+        let x4 = (x[min(r4, last) * n + j4] - mean4) * rstd4;
+        let x5 = (x[min(r5, last) * n + j5] - mean5) * rstd5;
+        let x6 = (x[min(r6, last) * n + j6] - mean6) * rstd6;
+        let x7 = (x[min(r7, last) * n + j7] - mean7) * rstd7;
+        let e0 = d_normalised(c0, x0, gamma0, beta0, d_y[min(r0, last) * n + j0]);
+        let e1 = d_normalised(c1, x1, gamma1, beta1, d_y[min(r1, last) * n + j1]);
+        let e2 = d_normalised(c2, x2, gamma2, beta2, d_y[min(r2, last) * n + j2]);
+        let e3 = d_normalised(c3, x3, gamma3, beta3, d_y[min(r3, last) * n + j3]);
+        let e4 = d_normalised(c4, x4, gamma4, beta4, d_y[min(r4, last) * n + j4]);
+        let e5 = d_normalised(c5, x5, gamma5, beta5, d_y[min(r5, last) * n + j5]);
+        let e6 = d_normalised(c6, x6, gamma6, beta6, d_y[min(r6, last) * n + j6]);
+        let e7 = d_normalised(c7, x7, gamma7, beta7, d_y[min(r7, last) * n + j7]);
+        let sums = total(Slots(
+            vec4(dot(e0, vec4(1.0)), dot(e1, vec4(1.0)), dot(e2, vec4(1.0)), dot(e3, vec4(1.0))),
+            vec4(dot(e4, vec4(1.0)), dot(e5, vec4(1.0)), dot(e6, vec4(1.0)), dot(e7, vec4(1.0))),
+        ), per_row);
+        let alongs = total(Slots(
+            vec4(dot(e0, x0), dot(e1, x1), dot(e2, x2), dot(e3, x3)),
+            vec4(dot(e4, x4), dot(e5, x5), dot(e6, x6), dot(e7, x7)),
+        ), per_row);
+        let mean = Slots(sums.a / f32(params.features), sums.b / f32(params.features));
+        let along = Slots(alongs.a / f32(params.features), alongs.b / f32(params.features));
+        put(r0, c0, rstd0 * (e0 - mean.a.x - x0 * along.a.x));
+        put(r1, c1, rstd1 * (e1 - mean.a.y - x1 * along.a.y));
+        put(r2, c2, rstd2 * (e2 - mean.a.z - x2 * along.a.z));
+        put(r3, c3, rstd3 * (e3 - mean.a.w - x3 * along.a.w));
+        put(r4, c4, rstd4 * (e4 - mean.b.x - x4 * along.b.x));
+        put(r5, c5, rstd5 * (e5 - mean.b.y - x5 * along.b.y));
+        put(r6, c6, rstd6 * (e6 - mean.b.z - x6 * along.b.z));
+        put(r7, c7, rstd7 * (e7 - mean.b.w - x7 * along.b.w));
     }
 }

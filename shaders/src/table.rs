@@ -132,10 +132,12 @@ table! {
         (direction: f32, step: f32, d_x_next: f32) -> (d_step: f32, d_direction: f32);
     /// `phi[r] (+)= density[r] feature[r]`; `density [rows]`, `feature, phi [rows, features]`. Extent: rows · features.
     DENSITY_SUM_FORWARD = "density_sum"/"forward", PointParams, tile FLAT,
-        (density: f32, feature: f32) -> (phi: f32);
+        (density: f32, feature: f32) -> (phi: f32),
+        or "forward_vec4" tile [256, 1, 1], when [FeaturesMultipleOf4];
     /// `d_density[r] = ⟨d_phi[r], feature[r]⟩`, `d_feature[r] = density[r] d_phi[r]`; both overwrite. Extent: rows.
     DENSITY_SUM_BACKWARD = "density_sum"/"backward", PointParams, tile FLAT,
-        (density: f32, feature: f32, d_phi: f32) -> (d_density: f32, d_feature: f32);
+        (density: f32, feature: f32, d_phi: f32) -> (d_density: f32, d_feature: f32),
+        or "backward_vec4" tile FLAT, when [FeaturesMultipleOf4];
     /// `depth = R[:,2] · (x - t)`, z in the camera frame: `x [rows,3]` → `depth [rows]`. Extent: rows.
     DEPTH_FORWARD = "depth"/"forward", RowsParams, tile FLAT,
         (world_from_camera: f32, x: f32) -> (depth: f32);
