@@ -95,8 +95,8 @@ fn main(
     let member = lane % 8u;
     let first = lane - member;
     let row = 256u * workgroup.x + 32u * team;
-    let in_a = 64u * workgroup.y + 4u * member;
-    let in_b = in_a + 32u;
+    let in_a = 64u * workgroup.y + 8u * member;
+    let in_b = in_a + 4u;
     let group = workgroup.z;
     if (row >= params.rows_per_group) {
         return;
@@ -119,18 +119,18 @@ fn main(
     var x_3b: Eight;
     for (var o = params.first_out / 4u; o < params.end_out / 4u; o++) {
         let wa = w_columns(w_a + 4u * o * stride, stride);
-        let wb = w_columns(w_b + 4u * o * stride, stride);
         let y0 = d_y[y_row.x + o];
         multiply_add(&x_0a, wa, y0, first);
-        multiply_add(&x_0b, wb, y0, first);
         let y1 = d_y[y_row.y + o];
         multiply_add(&x_1a, wa, y1, first);
-        multiply_add(&x_1b, wb, y1, first);
         let y2 = d_y[y_row.z + o];
         multiply_add(&x_2a, wa, y2, first);
-        multiply_add(&x_2b, wb, y2, first);
         let y3 = d_y[y_row.w + o];
         multiply_add(&x_3a, wa, y3, first);
+        let wb = w_columns(w_b + 4u * o * stride, stride);
+        multiply_add(&x_0b, wb, y0, first);
+        multiply_add(&x_1b, wb, y1, first);
+        multiply_add(&x_2b, wb, y2, first);
         multiply_add(&x_3b, wb, y3, first);
     }
     store(group, row, in_a, x_0a);

@@ -110,8 +110,8 @@ fn main(
     // Columns of x and d_y, in vectors; the last one stands in for those beyond it, which are not stored.
     let x_stride = params.in_features / 4u;
     let y_stride = params.out_features / 4u;
-    let in_a = in_ + 4u * member;
-    let in_b = in_a + 32u;
+    let in_a = in_ + 8u * member;
+    let in_b = in_a + 4u;
     let x_a = min(in_a / 4u, x_stride - 1u);
     let x_b = min(in_b / 4u, x_stride - 1u);
     let o = min(out / 4u + member, y_stride - 1u);

@@ -95,8 +95,8 @@ fn main(
     let member = lane % 8u;
     let first = lane - member;
     let row = 256u * workgroup.x + 32u * team;
-    let out_a = 64u * workgroup.y + 4u * member;
-    let out_b = out_a + 32u;
+    let out_a = 64u * workgroup.y + 8u * member;
+    let out_b = out_a + 4u;
     let group = workgroup.z;
     if (row >= params.rows_per_group) {
         return;
@@ -119,18 +119,18 @@ fn main(
     var y_3b: Eight;
     for (var i = 0u; i < n; i++) {
         let wa = w_columns(w_a, i);
-        let wb = w_columns(w_b, i);
         let x0 = x[x_row.x + i];
         multiply_add(&y_0a, wa, x0, first);
-        multiply_add(&y_0b, wb, x0, first);
         let x1 = x[x_row.y + i];
         multiply_add(&y_1a, wa, x1, first);
-        multiply_add(&y_1b, wb, x1, first);
         let x2 = x[x_row.z + i];
         multiply_add(&y_2a, wa, x2, first);
-        multiply_add(&y_2b, wb, x2, first);
         let x3 = x[x_row.w + i];
         multiply_add(&y_3a, wa, x3, first);
+        let wb = w_columns(w_b, i);
+        multiply_add(&y_0b, wb, x0, first);
+        multiply_add(&y_1b, wb, x1, first);
+        multiply_add(&y_2b, wb, x2, first);
         multiply_add(&y_3b, wb, x3, first);
     }
     let bias = w_first + params.out_features * n;

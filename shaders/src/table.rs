@@ -116,7 +116,8 @@ table! {
         or "backward_input_subgroup" tile [256, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Sums of `d_y x̂` and `d_y` (where `y > 0`) over the rows of each chunk: `partial [chunks, 2, features]`. Extent: features × chunks.
     LAYER_NORM_RELU_BACKWARD_AFFINE = "layer_norm_relu"/"backward_affine", LayerNormParams, tile [64, 1, 1],
-        (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32);
+        (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32),
+        or "backward_affine_vec4" tile [256, 1, 1], when [FeaturesMultipleOf4];
     /// Gates in the order i, f, g, o: `c = σ(f) c_prev + σ(i) tanh(g)`, `h = σ(o) tanh(c)`.
     /// `gates [rows, 4·hidden]` before activation, `c_prev [rows, hidden]` → `h, c [rows, hidden]`. Extent: rows · hidden.
     LSTM_CELL_FORWARD = "lstm_cell"/"forward", LstmParams, tile FLAT,

@@ -56,6 +56,8 @@ pub static BACKWARD_AFFINE: KernelTest = KernelTest {
         ("backward_affine", "d_gamma += e * normalised", "d_gamma += e"),
         ("backward_affine", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
         ("backward_affine", "> 0.0)", "> 1.0)"),
+        ("backward_affine_vec4", "d_gamma += e * normalised", "d_gamma += e"),
+        ("backward_affine_vec4", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
     ],
 };
 

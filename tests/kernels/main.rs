@@ -194,6 +194,16 @@ fn every_kernel_has_a_test_and_every_variant_a_planted_fault() {
     }
 }
 
+/// llvmpipe's subgroups have 8 lanes, unless this variable makes them 16 where the processor can; then kernels that work in
+/// teams of eight have several to a subgroup, as on a real GPU. Read when the driver is loaded: in a process of its own.
+#[test]
+fn subgroups_of_several_teams() {
+    let mut tests = std::process::Command::new(std::env::current_exe().expect("this program has a path"));
+    tests.args(["linear::", "layer_norm_relu::", "--quiet"]).env("LP_NATIVE_VECTOR_WIDTH", "512");
+    let output = tests.output().expect("this program runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));
+}
+
 #[test]
 fn planted_fault() {
     let runs =
