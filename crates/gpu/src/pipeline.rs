@@ -51,7 +51,11 @@ impl Pipeline {
                 layout: Some(&pipeline_layout),
                 module: &module,
                 entry_point: None,
-                compilation_options: Default::default(),
+                // Our kernels write what they read of it.
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    zero_initialize_workgroup_memory: false,
+                    ..Default::default()
+                },
                 cache: None,
             });
             Pipeline { compute, layout, slots: slots.iter().map(|&(binding, slot, _)| (binding, slot)).collect() }
