@@ -1,6 +1,6 @@
 //! Which variant of its kernel a step runs: measured once for a device, a text and a shape, then kept in a file.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::SystemTime;
@@ -12,6 +12,9 @@ use srn_shaders::{Requirement, Variant};
 use crate::Gpu;
 use crate::executor::Launch;
 use crate::gpu::lock;
+
+/// Where choices are kept: a line for each, a hash and `op/variant`.
+const FILE: &str = "variants.txt";
 
 /// How the variants of kernels are chosen.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -41,15 +44,20 @@ impl Default for Choice {
 #[derive(Debug, Default)]
 pub(crate) struct Chooser {
     choice: Choice,
-    known: Mutex<Known>,
+    chosen: Mutex<HashMap<Shape, &'static Variant>>,
 }
 
-/// `op/variant` by what it was measured for.
-type Known = BTreeMap<String, String>;
+/// A kernel, the widths of a step, and its extent up to the next power of two.
+type Shape = (&'static str, Vec<u32>);
 
 impl Chooser {
     pub fn new(choice: Choice) -> Self {
-        Chooser { choice, known: Mutex::default() }
+        Chooser { choice, chosen: Mutex::default() }
+    }
+
+    /// The same choice with nothing chosen yet: for other texts.
+    pub fn afresh(&self) -> Self {
+        Chooser::new(self.choice.clone())
     }
 
     /// The variant for a step; `launch` makes the step with a variant and a part of its extent ready to be timed.
@@ -59,30 +67,39 @@ impl Chooser {
         step: &Step,
         launch: impl Fn(&Variant, [u32; 3]) -> Result<Launch, ExecutorError>,
     ) -> Result<&'static Variant, ExecutorError> {
-        let usable: Vec<&'static Variant> = step.kernel.variants.iter().filter(|variant| is_usable(variant, step, gpu)).collect();
-        let named = |label: &str| usable.iter().copied().find(|variant| label == step.kernel.label(variant));
-        let cache = match &self.choice {
-            _ if usable.len() == 1 => return Ok(usable[0]),
-            Choice::Named(name) => return Ok(named(&format!("{}/{name}", step.kernel.op)).unwrap_or(usable[0])),
-            Choice::Measured { cache } => cache.as_deref(),
-        };
-        let key = key(gpu, step, &usable);
+        let shape = (step.kernel.name, widths(step).chain(step.extent.map(u32::next_power_of_two)).collect());
         // Held while measuring: two plans that are built at once would spoil each other's times.
-        let mut known = lock(&self.known);
-        if known.is_empty() {
-            *known = cache.and_then(|folder| read(folder).ok()).unwrap_or_default();
-        }
-        if let Some(variant) = known.get(&key).and_then(|label| named(label)) {
+        let mut chosen = lock(&self.chosen);
+        if let Some(variant) = chosen.get(&shape) {
             return Ok(variant);
         }
-        let fastest = measure(gpu, step, &usable, launch)?;
-        // What another process has chosen meanwhile holds for both.
-        known.extend(cache.and_then(|folder| read(folder).ok()).unwrap_or_default());
-        let variant = known.get(&key).and_then(|label| named(label)).unwrap_or(fastest);
-        known.insert(key, step.kernel.label(variant));
-        if let Some(Err(error)) = cache.map(|folder| write(folder, &known)) {
-            tracing::debug!(%error, ?cache, "the choice cannot be kept");
-        }
+        let usable: Vec<&'static Variant> = step.kernel.variants.iter().filter(|variant| is_usable(variant, step, gpu)).collect();
+        let variant = match &self.choice {
+            _ if usable.len() == 1 => usable[0],
+            Choice::Named(name) => usable.iter().find(|variant| variant.name == name).unwrap_or(&usable[0]),
+            Choice::Measured { cache: None } => measure(gpu, step, &usable, launch)?,
+            Choice::Measured { cache: Some(folder) } => {
+                let key = key(gpu, step, &shape, &usable);
+                let kept = || {
+                    let label = read(folder).ok()?.remove(&key)?;
+                    usable.iter().copied().find(|variant| step.kernel.label(variant) == label)
+                };
+                match kept() {
+                    Some(variant) => variant,
+                    None => {
+                        let fastest = measure(gpu, step, &usable, launch)?;
+                        // What another process has chosen meanwhile holds for both.
+                        kept().unwrap_or_else(|| {
+                            if let Err(error) = keep(folder, &key, step.kernel.label(fastest)) {
+                                tracing::debug!(%error, ?folder, "the choice cannot be kept");
+                            }
+                            fastest
+                        })
+                    }
+                }
+            }
+        };
+        chosen.insert(shape, variant);
         Ok(variant)
     }
 }
@@ -102,12 +119,10 @@ fn widths(step: &Step) -> impl Iterator<Item = u32> {
     fields.map(|&(_, _, offset)| bytemuck::pod_read_unaligned(&step.params[offset..offset + 4]))
 }
 
-/// What a measurement holds for: the device, the texts, the widths, and the extent up to the next power of two.
-fn key(gpu: &Gpu, step: &Step, usable: &[&Variant]) -> String {
+/// What a measurement holds for: the device, the shape and the texts.
+fn key(gpu: &Gpu, step: &Step, shape: &Shape, usable: &[&Variant]) -> String {
     let texts: Vec<String> = usable.iter().map(|variant| gpu.source(step.kernel, variant)).collect();
-    let shape: Vec<u32> = widths(step).chain(step.extent.map(u32::next_power_of_two)).collect();
-    let hash = fnv(format!("{} {} {texts:?} {shape:?}", gpu.adapter(), step.kernel.name).as_bytes());
-    format!("{hash:016x}")
+    format!("{:016x}", fnv(format!("{} {shape:?} {texts:?}", gpu.adapter()).as_bytes()))
 }
 
 /// Fowler, Noll and Vo's hash 1a: the standard library's may change with its version.
@@ -168,19 +183,21 @@ fn measure(
     Ok(fastest)
 }
 
-/// Lines of a key and a label; others are left out.
-fn read(folder: &Path) -> io::Result<Known> {
-    let text = fs::read_to_string(folder.join("variants.txt"))?;
+/// The labels `op/variant` by their keys; lines that are none are left out.
+fn read(folder: &Path) -> io::Result<BTreeMap<String, String>> {
+    let text = fs::read_to_string(folder.join(FILE))?;
     let lines = text.lines().filter_map(|line| line.split_once(' '));
     Ok(lines.map(|(key, label)| (key.to_owned(), label.to_owned())).collect())
 }
 
-/// Whole or not at all: another process may be reading.
-fn write(folder: &Path, known: &Known) -> io::Result<()> {
-    fs::create_dir_all(folder)?;
+/// Adds a line to the file, which is written whole or not at all: another process may be reading.
+fn keep(folder: &Path, key: &str, label: String) -> io::Result<()> {
+    let mut known = read(folder).unwrap_or_default();
+    known.insert(key.to_owned(), label);
     let lines: String = known.iter().map(|(key, label)| format!("{key} {label}\n")).collect();
     let nanoseconds = SystemTime::UNIX_EPOCH.elapsed().map_or(0, |time| time.as_nanos());
-    let new = folder.join(format!("variants.{}.{nanoseconds}", std::process::id()));
+    let new = folder.join(format!("{FILE}.{}.{nanoseconds}", std::process::id()));
+    fs::create_dir_all(folder)?;
     fs::write(&new, lines)?;
-    fs::rename(&new, folder.join("variants.txt")).inspect_err(|_| drop(fs::remove_file(&new)))
+    fs::rename(&new, folder.join(FILE)).inspect_err(|_| drop(fs::remove_file(&new)))
 }

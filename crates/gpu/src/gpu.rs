@@ -157,7 +157,7 @@ impl Gpu {
 
     /// The same device, with WGSL texts from `sources` in place of [`Kernel::source`]: kernels in development, planted faults.
     pub fn with_sources(&self, sources: impl Fn(&Kernel, &Variant) -> String + Send + Sync + 'static) -> Gpu {
-        Gpu { sources: Arc::new(sources), ..self.clone() }
+        Gpu { sources: Arc::new(sources), chooser: Arc::new(self.chooser.afresh()), ..self.clone() }
     }
 
     /// The same device, with the variants of kernels chosen in this way.
