@@ -130,10 +130,33 @@ fn fnv(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3))
 }
 
-/// Work that a software adapter is timed on, in floating-point operations; a real GPU, which needs many rows to show
-/// what it can, is timed on the whole.
-const SAMPLE: u64 = 200_000_000;
-const ROUNDS: usize = 5;
+/// Work that a software adapter is timed on, in floating-point operations: a millisecond or a few, which other programs
+/// leave alone more often than not. A real GPU, which needs many rows to show what it can, is timed on the whole.
+const SAMPLE: u64 = 100_000_000;
+/// Most times that a variant is timed.
+const MOST_ROUNDS: usize = 20;
+/// Times that differ by less are the same.
+const SAME: f64 = 1.1;
+
+/// A variant with its times so far, the two shortest of them.
+struct Candidate {
+    variant: &'static Variant,
+    launch: Launch,
+    best: f64,
+    second: f64,
+}
+
+impl Candidate {
+    fn add(&mut self, seconds: f64) {
+        self.second = self.second.min(seconds.max(self.best));
+        self.best = self.best.min(seconds);
+    }
+
+    /// Other programs only ever make a time longer, and hardly ever twice by the same.
+    fn is_settled(&self) -> bool {
+        self.second <= SAME * self.best
+    }
+}
 
 fn measure(
     gpu: &Gpu,
@@ -148,37 +171,35 @@ fn measure(
         extent[longest] = extent[longest].div_ceil(2);
         flops /= 2;
     }
-    let mut tried = Vec::new();
+    let mut candidates = Vec::new();
     for &variant in usable {
         match launch(variant, extent) {
-            Ok(launch) => tried.push((f64::INFINITY, variant, launch)),
+            Ok(launch) => candidates.push(Candidate { variant, launch, best: f64::INFINITY, second: f64::INFINITY }),
             Err(error) => tracing::debug!(%error, "not a candidate"),
         }
     }
-    // The first round compiles. Then the slow ones drop out, the later the closer: other programs disturb single rounds.
-    for round in 0..=ROUNDS {
-        let best = tried.iter().map(|candidate| candidate.0).fold(f64::INFINITY, f64::min);
-        let chance = 1.0 + 4.0 / round as f64;
-        let near: Vec<usize> = (0..tried.len()).filter(|&index| tried[index].0 <= chance * best).collect();
-        if near.len() <= 1 {
+    if let [] | [_] = candidates[..] {
+        return Ok(candidates.first().map_or(usable[0], |only| only.variant));
+    }
+    // The first time is that of compiling.
+    gpu.time(&candidates.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
+    for _ in 0..MOST_ROUNDS {
+        let best = candidates.iter().map(|candidate| candidate.best).fold(f64::INFINITY, f64::min);
+        let is_open = |candidate: &&mut Candidate| !(candidate.is_settled() && candidate.best > SAME * best);
+        let mut open: Vec<&mut Candidate> = candidates.iter_mut().filter(is_open).collect();
+        if open.len() <= 1 || (best.is_finite() && open.iter().all(|candidate| candidate.is_settled())) {
             break;
         }
-        let launches: Vec<&Launch> = near.iter().map(|&index| &tried[index].2).collect();
-        for (index, seconds) in near.into_iter().zip(gpu.time(&launches)?) {
-            if round > 0 {
-                tried[index].0 = seconds.min(tried[index].0);
-            }
-        }
+        let seconds = gpu.time(&open.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
+        open.iter_mut().zip(seconds).for_each(|(candidate, seconds)| candidate.add(seconds));
     }
-    let fastest = tried.iter().min_by(|a, b| a.0.total_cmp(&b.0));
-    let times: Vec<String> =
-        tried.iter().map(|(seconds, variant, _)| format!("{} {:.3} ms", variant.name, 1e3 * seconds)).collect();
-    let fastest = fastest.map_or(usable[0], |candidate| candidate.1);
+    let fastest = candidates.iter().min_by(|a, b| a.best.total_cmp(&b.best)).map_or(usable[0], |fastest| fastest.variant);
+    let times = candidates.iter().map(|candidate| format!("{} {:.3} ms", candidate.variant.name, 1e3 * candidate.best));
     tracing::debug!(
         kernel = step.kernel.name,
         widths = ?widths(step).collect::<Vec<_>>(),
         extent = ?step.extent,
-        "chose {}: {}", fastest.name, times.join(", ")
+        "chose {}: {}", fastest.name, times.collect::<Vec<_>>().join(", ")
     );
     Ok(fastest)
 }
