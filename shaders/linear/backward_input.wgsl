@@ -1,5 +1,5 @@
 // d_x[r, i] (+)= Σ_o W[o, i] d_y[r, o] for o in first_out .. end_out, weights at slots[first_group + r / rows_per_group] · weight_stride.
-// One invocation computes 4 rows × 4 input features in registers, four output features at a time.
+// One invocation computes 8 rows × 4 input features in registers, one output feature at a time.
 // d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, rows_per_group, in].
 // ACCUMULATES d_x where accumulate is 1, else OVERWRITES it.
 
@@ -31,54 +31,64 @@ fn weights_of(group: u32) -> u32 {
     return slots[params.first_group + group] * params.weight_stride;
 }
 
-// The values at four indices.
-fn d_y4(at: vec4<u32>) -> vec4<f32> {
-    return vec4(d_y[at.x], d_y[at.y], d_y[at.z], d_y[at.w]);
-}
-
-fn w4(at: vec4<u32>) -> vec4<f32> {
-    return vec4(weights[at.x], weights[at.y], weights[at.z], weights[at.w]);
+fn store(group: u32, row: u32, in_: u32, values: vec4<f32>) {
+    if (row >= params.rows_per_group) {
+        return;
+    }
+    let first = (group * params.rows_per_group + row) * params.in_features + in_;
+    for (var i = 0u; i < min(params.in_features - in_, 4u); i++) {
+        var value = values[i];
+        if (params.accumulate == 1u) {
+            value += d_x[first + i];
+        }
+        d_x[first + i] = value;
+    }
 }
 
 @compute @workgroup_size(8, 8)
 fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_id) local: vec3<u32>) {
-    let tile_at = 4u * tile_index(workgroup, local, vec2(params.rows_per_group, params.in_features));
-    let row = tile_at.x;
-    let in_ = tile_at.y;
+    let tile_at = tile_index(workgroup, local, vec2(params.rows_per_group, params.in_features));
+    let row = 8u * tile_at.x;
+    let in_ = 4u * tile_at.y;
     let group = workgroup.z;
     if (row >= params.rows_per_group || in_ >= params.in_features || group >= params.groups) {
         return;
     }
-    // Where four rows of d_y and four columns of W begin; the last one stands in for those beyond it, which are not stored.
-    let n = params.in_features;
-    let lane = vec4(0u, 1u, 2u, 3u);
-    let y_row = (group * params.rows_per_group + min(row + lane, vec4(params.rows_per_group - 1u))) * params.out_features;
-    let w_column = weights_of(group) + min(in_ + lane, vec4(n - 1u));
+    // Where the rows of d_y and the columns of W begin; the last one stands in for those beyond it, which are not stored.
+    let n = params.out_features;
+    let four = vec4(0u, 1u, 2u, 3u);
+    let y_first = vec4(group * params.rows_per_group);
+    let y_last = vec4(params.rows_per_group - 1u);
+    let y_a = (y_first + min(row + four, y_last)) * n;
+    let y_b = (y_first + min(row + 4u + four, y_last)) * n;
+    let column = weights_of(group) + min(in_ + four, vec4(params.in_features - 1u));
 
-    // Columns are rows of d_x. Output features beyond the last one have weight zero.
-    var tile: mat4x4<f32>;
-    for (var o = params.first_out; o < params.end_out; o += 4u) {
-        let at = min(o + lane, vec4(params.end_out - 1u));
-        let inside = select(vec4(0.0), vec4(1.0), o + lane < vec4(params.end_out));
-        let ys = mat4x4(d_y4(y_row.x + at), d_y4(y_row.y + at), d_y4(y_row.z + at), d_y4(y_row.w + at));
-        let ws = mat4x4(
-            w4(w_column + at.x * n) * inside.x,
-            w4(w_column + at.y * n) * inside.y,
-            w4(w_column + at.z * n) * inside.z,
-            w4(w_column + at.w * n) * inside.w,
-        );
-        tile += ws * ys;
+    var x0: vec4<f32>;
+    var x1: vec4<f32>;
+    var x2: vec4<f32>;
+    var x3: vec4<f32>;
+    var x4: vec4<f32>;
+    var x5: vec4<f32>;
+    var x6: vec4<f32>;
+    var x7: vec4<f32>;
+    for (var o = params.first_out; o < params.end_out; o++) {
+        let at = column + o * params.in_features;
+        let w = vec4(weights[at.x], weights[at.y], weights[at.z], weights[at.w]);
+        x0 += w * d_y[y_a.x + o];
+        x1 += w * d_y[y_a.y + o];
+        x2 += w * d_y[y_a.z + o];
+        x3 += w * d_y[y_a.w + o];
+        x4 += w * d_y[y_b.x + o];
+        x5 += w * d_y[y_b.y + o];
+        x6 += w * d_y[y_b.z + o];
+        x7 += w * d_y[y_b.w + o];
     }
-
-    for (var r = 0u; r < min(params.rows_per_group - row, 4u); r++) {
-        let values = tile[r];
-        let first = (group * params.rows_per_group + row + r) * n + in_;
-        for (var i = 0u; i < min(n - in_, 4u); i++) {
-            if (params.accumulate == 1u) {
-                d_x[first + i] += values[i];
-            } else {
-                d_x[first + i] = values[i];
-            }
-        }
-    }
+    store(group, row, in_, x0);
+    store(group, row + 1u, in_, x1);
+    store(group, row + 2u, in_, x2);
+    store(group, row + 3u, in_, x3);
+    store(group, row + 4u, in_, x4);
+    store(group, row + 5u, in_, x5);
+    store(group, row + 6u, in_, x6);
+    store(group, row + 7u, in_, x7);
 }

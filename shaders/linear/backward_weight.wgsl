@@ -31,12 +31,12 @@ fn d_y4(at: vec4<u32>) -> vec4<f32> {
     return vec4(d_y[at.x], d_y[at.y], d_y[at.z], d_y[at.w]);
 }
 
-fn put(at: u32, value: f32) {
+fn put(at: u32, sum: f32) {
+    var value = sum;
     if (params.accumulate == 1u) {
-        partial[at] += value;
-    } else {
-        partial[at] = value;
+        value += partial[at];
     }
+    partial[at] = value;
 }
 
 @compute @workgroup_size(8, 8)

@@ -33,12 +33,12 @@ fn d_y_columns(row: vec4<u32>, o: u32, inside: vec4<f32>) -> mat4x4<f32> {
     return mat4x4(d_y[at.x] * inside.x, d_y[at.y] * inside.y, d_y[at.z] * inside.z, d_y[at.w] * inside.w);
 }
 
-fn put(at: u32, value: vec4<f32>) {
+fn put(at: u32, sum: vec4<f32>) {
+    var value = sum;
     if (params.accumulate == 1u) {
-        partial[at] += value;
-    } else {
-        partial[at] = value;
+        value += partial[at];
     }
+    partial[at] = value;
 }
 
 // Columns are rows of the weight.

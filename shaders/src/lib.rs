@@ -40,11 +40,13 @@ pub struct Binding {
 /// What a faster form of a kernel needs before it may replace the plain one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Requirement {
-    /// Nothing: any adapter, any size.
-    Nothing,
     /// Every parameter named `features`, `in_features`, `out_features`, `first_out` or `end_out` is a multiple of 4 (f32
     /// buffers may be read as `vec4<f32>`).
     FeaturesMultipleOf4,
+    /// None of those parameters exceeds 256.
+    FeaturesAtMost256,
+    /// The device has subgroups, always of at least eight lanes.
+    Subgroups,
 }
 
 /// One WGSL text that computes a kernel; every kernel has at least one, and its plain form runs everywhere.
@@ -56,8 +58,8 @@ pub struct Variant {
     pub text: &'static str,
     /// Elements of the step's extent that one workgroup covers, per dimension.
     pub tile: [u32; 3],
-    /// When it may be used.
-    pub requires: Requirement,
+    /// What must hold before it may be used; nothing for the plain form.
+    pub requires: &'static [Requirement],
 }
 
 /// One kernel: an op in one direction.
@@ -73,7 +75,7 @@ pub struct Kernel {
     pub bindings: &'static [Binding],
     /// The Rust mirror of the WGSL `Params`.
     pub params: &'static ParamsLayout,
-    /// Plain form first, then forms that are preferred where their requirement holds.
+    /// Plain form first, then forms for some sizes or devices.
     pub variants: &'static [Variant],
 }
 
@@ -81,6 +83,11 @@ impl Kernel {
     /// The complete WGSL source of one variant: shared functions, then the kernel.
     pub fn source(&self, variant: &Variant) -> String {
         format!("{COMMON}\n{}", variant.text)
+    }
+
+    /// `op/variant`, in profiles and errors.
+    pub fn label(&self, variant: &Variant) -> String {
+        format!("{}/{}", self.op, variant.name)
     }
 
     /// The binding called `name`.

@@ -17,7 +17,7 @@ macro_rules! table {
         $(#[$doc:meta])*
         $id:ident = $op:literal / $direction:literal, $params:ident, tile $tile:expr,
         ($($in:ident: $in_ty:ident),*) -> ($($out:ident: $out_ty:ident),*)
-        $(, or $variant:literal tile $variant_tile:expr, when $requires:ident)*;
+        $(, or $variant:literal tile $variant_tile:expr, when [$($requires:ident),+])*;
     )*) => {
         $(
             $(#[$doc])*
@@ -35,13 +35,13 @@ macro_rules! table {
                         name: $direction,
                         text: include_str!(concat!("../", $op, "/", $direction, ".wgsl")),
                         tile: $tile,
-                        requires: Requirement::Nothing,
+                        requires: &[],
                     },
                     $(Variant {
                         name: $variant,
                         text: include_str!(concat!("../", $op, "/", $variant, ".wgsl")),
                         tile: $variant_tile,
-                        requires: Requirement::$requires,
+                        requires: &[$(Requirement::$requires),+],
                     },)*
                 ],
             };
@@ -82,30 +82,39 @@ table! {
         (index: u32, d_z: f32) -> (d_codes: f32);
     /// `y[r,o] (+)= Σ_i W[o,i] x[r,i] + b[o]`, weights at `slots[first_group + r / rows_per_group] · weight_stride`.
     /// Extent: rows of a group × out_features × groups.
-    LINEAR_FORWARD = "linear"/"forward", LinearParams, tile [32, 32, 1],
+    LINEAR_FORWARD = "linear"/"forward", LinearParams, tile [64, 32, 1],
         (x: f32, weights: f32, slots: u32) -> (y: f32),
-        or "forward_vec4" tile [64, 64, 1], when FeaturesMultipleOf4;
+        or "forward_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
+        or "forward_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
+        or "forward_subgroup" tile [256, 64, 1], when [FeaturesMultipleOf4, Subgroups];
     /// `d_x[r,i] (+)= Σ_{o=first_out}^{end_out-1} W[o,i] d_y[r,o]`. Extent: rows of a group × in_features × groups.
-    LINEAR_BACKWARD_INPUT = "linear"/"backward_input", LinearParams, tile [32, 32, 1],
+    LINEAR_BACKWARD_INPUT = "linear"/"backward_input", LinearParams, tile [64, 32, 1],
         (d_y: f32, weights: f32, slots: u32) -> (d_x: f32),
-        or "backward_input_vec4" tile [64, 64, 1], when FeaturesMultipleOf4;
+        or "backward_input_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
+        or "backward_input_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
+        or "backward_input_subgroup" tile [256, 64, 1], when [FeaturesMultipleOf4, Subgroups];
     /// `partial[g,c] (+)= (Σ_r d_y[r,o] x[r,i], Σ_r d_y[r,o])` over the rows of chunk `c`: weight, then bias; `[groups, chunks, out·in + out]`.
     /// Extent: out_features × in_features × (groups · chunks). (Independent of `slots`: group `g` writes set `g`.)
     LINEAR_BACKWARD_WEIGHT = "linear"/"backward_weight", LinearParams, tile [32, 32, 1],
         (x: f32, d_y: f32) -> (partial: f32),
-        or "backward_weight_vec4" tile [64, 64, 1], when FeaturesMultipleOf4;
+        or "backward_weight_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
+        or "backward_weight_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
+        or "backward_weight_subgroup" tile [128, 128, 1], when [FeaturesMultipleOf4, Subgroups];
     /// `y = relu(gamma (x - mean) rstd + beta)`, `rstd = 1/√(var + 1e-5)`, biased variance.
     /// `x [rows, features]`, `affine [2, features]` → `y`, `stats [rows,2]` = (mean, rstd). Extent: rows.
     LAYER_NORM_RELU_FORWARD = "layer_norm_relu"/"forward", LayerNormParams, tile FLAT,
         (x: f32, affine: f32) -> (y: f32, stats: f32),
-        or "forward_vec4" tile FLAT, when FeaturesMultipleOf4;
+        or "forward_vec4" tile FLAT, when [FeaturesMultipleOf4],
+        or "forward_subgroup" tile [256, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Gradient to `x`: with `e = gamma · d_y` where `y > 0`, else 0: `d_x = rstd (e - mean(e) - x̂ mean(e x̂))`. Extent: rows.
     LAYER_NORM_RELU_BACKWARD_INPUT = "layer_norm_relu"/"backward_input", LayerNormParams, tile FLAT,
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (d_x: f32),
-        or "backward_input_vec4" tile FLAT, when FeaturesMultipleOf4;
+        or "backward_input_vec4" tile FLAT, when [FeaturesMultipleOf4],
+        or "backward_input_subgroup" tile [256, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Sums of `d_y x̂` and `d_y` (where `y > 0`) over the rows of each chunk: `partial [chunks, 2, features]`. Extent: features × chunks.
     LAYER_NORM_RELU_BACKWARD_AFFINE = "layer_norm_relu"/"backward_affine", LayerNormParams, tile [64, 1, 1],
-        (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32);
+        (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32),
+        or "backward_affine_vec4" tile [256, 1, 1], when [FeaturesMultipleOf4];
     /// Gates in the order i, f, g, o: `c = σ(f) c_prev + σ(i) tanh(g)`, `h = σ(o) tanh(c)`.
     /// `gates [rows, 4·hidden]` before activation, `c_prev [rows, hidden]` → `h, c [rows, hidden]`. Extent: rows · hidden.
     LSTM_CELL_FORWARD = "lstm_cell"/"forward", LstmParams, tile FLAT,
@@ -121,10 +130,12 @@ table! {
         (direction: f32, step: f32, d_x_next: f32) -> (d_step: f32, d_direction: f32);
     /// `phi[r] (+)= density[r] feature[r]`; `density [rows]`, `feature, phi [rows, features]`. Extent: rows · features.
     DENSITY_SUM_FORWARD = "density_sum"/"forward", PointParams, tile FLAT,
-        (density: f32, feature: f32) -> (phi: f32);
+        (density: f32, feature: f32) -> (phi: f32),
+        or "forward_vec4" tile [256, 1, 1], when [FeaturesMultipleOf4];
     /// `d_density[r] = ⟨d_phi[r], feature[r]⟩`, `d_feature[r] = density[r] d_phi[r]`; both overwrite. Extent: rows.
     DENSITY_SUM_BACKWARD = "density_sum"/"backward", PointParams, tile FLAT,
-        (density: f32, feature: f32, d_phi: f32) -> (d_density: f32, d_feature: f32);
+        (density: f32, feature: f32, d_phi: f32) -> (d_density: f32, d_feature: f32),
+        or "backward_vec4" tile FLAT, when [FeaturesMultipleOf4];
     /// `depth = R[:,2] · (x - t)`, z in the camera frame: `x [rows,3]` → `depth [rows]`. Extent: rows.
     DEPTH_FORWARD = "depth"/"forward", RowsParams, tile FLAT,
         (world_from_camera: f32, x: f32) -> (depth: f32);

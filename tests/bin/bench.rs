@@ -35,6 +35,7 @@ struct Row {
 
 /// Time of one kernel in one run of a stage.
 struct KernelRow {
+    width: u32,
     executor: &'static str,
     label: String,
     steps: usize,
@@ -78,10 +79,8 @@ fn run() -> Result<()> {
             let mut bench = Bench { engine, model: &model, runs, ceilings: &mut ceilings };
             let (row, profile) = bench.pose_step()?;
             rows.push(row);
-            kernels.extend(profile.into_iter().filter(|_| width == 64));
-            if width == 64 || engine.as_gpu().is_none() {
-                rows.push(bench.training_step()?);
-            }
+            kernels.extend(profile);
+            rows.push(bench.training_step()?);
             rows.push(bench.picture()?);
             rows.iter().rev().take(3).rev().filter(|row| row.width == width).for_each(|row| eprintln!("{}", line(row)));
         }
@@ -169,7 +168,7 @@ impl Bench<'_> {
             Ok(())
         })?;
         let row = self.row("pose step, 5 hypotheses", time, descent.flops_per_step(), descent.bytes());
-        Ok((row, profile(&mut descent, name(self.engine))?))
+        Ok((row, profile(&mut descent, self.model.layout.features(), name(self.engine))?))
     }
 
     fn training_step(&mut self) -> Result<Row> {
@@ -202,18 +201,18 @@ impl Bench<'_> {
 }
 
 /// Time of each kernel: from the device's clock on a GPU, from ours on the CPU.
-fn profile(descent: &mut Descent, executor_name: &'static str) -> Result<Vec<KernelRow>> {
-    let row = |(label, (steps, seconds, flops))| KernelRow { executor: executor_name, label, steps, seconds, flops };
+fn profile(descent: &mut Descent, width: u32, executor: &'static str) -> Result<Vec<KernelRow>> {
+    let row = |(label, (steps, seconds, flops))| KernelRow { width, executor, label, steps, seconds, flops };
     if let Some(times) = descent.profile()? {
         return Ok(times.into_iter().map(|time| row((time.label, (time.steps, time.seconds, time.flops)))).collect());
     }
-    let executor = descent.executor();
-    let plan = executor.plan().clone();
+    let running = descent.executor();
+    let plan = running.plan().clone();
     let evaluate = plan.stages.iter().position(|stage| stage.name == "evaluate").expect("a descent evaluates");
     let mut times: BTreeMap<String, (usize, f64, u64)> = BTreeMap::new();
     for (index, step) in plan.stages[evaluate].steps.iter().enumerate() {
         let begin = Instant::now();
-        executor.run_step(plan.stage_id(evaluate), index)?;
+        running.run_step(plan.stage_id(evaluate), index)?;
         let (steps, seconds, flops) = times.entry(step.kernel.name.into()).or_default();
         *steps += 1;
         *seconds += begin.elapsed().as_secs_f64();
@@ -289,12 +288,11 @@ fn report(hardware: &str, ceiling: f64, rows: &[Row], kernels: &[KernelRow]) -> 
     text += "| work, 64 × 64 pixels | width | executor | median time | GFLOP | GFLOP/s | of sgemm | plan of budget |\n";
     text += "|---|---|---|---|---|---|---|---|\n";
     rows.iter().for_each(|row| text += &format!("{}\n", line(row)));
-    text += "\nKernels of a pose step at width 64, each timed alone:\n\n| executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|\n";
-    for executor in ["cpu", "gpu"] {
-        for kernel in kernels.iter().filter(|kernel| kernel.executor == executor).take(8) {
-            let KernelRow { label, steps, seconds, flops, .. } = kernel;
+    text += "\nKernels of a pose step, each timed alone:\n\n| width | executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|---|\n";
+    for of_one in kernels.chunk_by(|a, b| (a.width, a.executor) == (b.width, b.executor)) {
+        for KernelRow { width, executor, label, steps, seconds, flops } in of_one.iter().take(8) {
             let rate = if *flops == 0 { String::new() } else { format!("{:.1}", *flops as f64 / seconds / 1e9) };
-            text += &format!("| {executor} | `{label}` | {steps} | {:.1} | {rate} |\n", 1e3 * seconds);
+            text += &format!("| {width} | {executor} | `{label}` | {steps} | {:.1} | {rate} |\n", 1e3 * seconds);
         }
     }
     text
@@ -314,7 +312,7 @@ fn as_json(hardware: &str, ceiling: f64, rows: &[Row], kernels: &[KernelRow]) ->
         .iter()
         .map(|kernel| {
             serde_json::json!({
-                "executor": kernel.executor, "kernel": kernel.label, "steps": kernel.steps, "seconds": kernel.seconds,
+                "width": kernel.width, "executor": kernel.executor, "kernel": kernel.label, "steps": kernel.steps, "seconds": kernel.seconds,
                 "flops": kernel.flops,
             })
         })

@@ -12,6 +12,8 @@ pub static FORWARD: KernelTest = KernelTest {
     faults: &[
         ("forward", "index / params.features", "index % params.features"),
         ("forward", "accumulate == 1u", "accumulate == 0u"),
+        ("forward_vec4", "index / n", "index % n"),
+        ("forward_vec4", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 
@@ -23,6 +25,8 @@ pub static BACKWARD: KernelTest = KernelTest {
     faults: &[
         ("backward", "sigma * d_phi[j]", "sigma * feature[j]"),
         ("backward", "d_phi[j] * feature[j]", "d_phi[j] * d_phi[j]"),
+        ("backward_vec4", "sigma * d_phi[j]", "sigma * feature[j]"),
+        ("backward_vec4", "dot(total, vec4(1.0))", "total.x"),
     ],
 };
 
@@ -36,7 +40,7 @@ fn backward_matches_reference() {
     BACKWARD.matches_reference();
 }
 
-const SIZES: [(u32, u32); 4] = [(1, 1), (7, 3), (129, 17), (33, 64)];
+const SIZES: [(u32, u32); 5] = [(1, 1), (7, 3), (129, 17), (33, 64), (70, 12)];
 
 fn forward() -> Vec<Case> {
     SIZES.iter().flat_map(|&(rows, features)| [false, true].map(|accumulate| forward_case(rows, features, accumulate))).collect()

@@ -1,6 +1,6 @@
 //! The GPU executor: that its results are a device's, and that what goes wrong there reaches the caller as an error.
 
-use srn_gpu::{Gpu, GpuExecutor, OpenError, wgpu};
+use srn_gpu::{Choice, Gpu, GpuExecutor, OpenError, wgpu};
 use srn_plan::ops::{latent_loss, linear, sum};
 use srn_plan::{BufferId, Builder, Executor, ExecutorError, Plan, Rows, StageId};
 use srn_tests::gpu;
@@ -98,6 +98,73 @@ fn a_profile_times_every_kernel() {
     assert_eq!(labels, [("latent_loss/forward", 3), ("sum/forward", 3)]);
     assert!(times.iter().all(|time| time.seconds > 0.0 && time.seconds < 10.0), "{times:?}");
     assert!(times[0].seconds >= times[1].seconds);
+}
+
+/// A layer that several variants can compute.
+fn product() -> (Plan, StageId, BufferId) {
+    let mut b = Builder::new(1 << 20);
+    let [x, weights] = [("x", 64 * 8), ("weights", 8 * 9)].map(|(name, len)| b.input(name, len).unwrap());
+    let slots = b.input_u32("slots", 1).unwrap();
+    let y = b.scratch("y", 64 * 8).unwrap();
+    let stage = b.stage("product");
+    let layer = linear::Layer { weights, in_features: 8, out_features: 8, sets: linear::Sets::Shared };
+    linear::forward(&mut b, Rows::plain(64), layer, x, slots, y, false).unwrap();
+    (b.finish().unwrap(), stage, y)
+}
+
+/// What a device chooses for the [`product`].
+fn chosen(gpu: &Gpu) -> String {
+    let (plan, stage, y) = product();
+    let mut executor = GpuExecutor::new(gpu, plan, u64::MAX).unwrap();
+    assert!(executor.read(y).unwrap().iter().all(|&value| value == 0.0), "measuring wrote into the plan's buffer");
+    executor.label(stage, 0).to_owned()
+}
+
+#[test]
+fn a_measured_choice_is_kept() {
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path().join("new/folder");
+    let measured = || gpu().with_choice(Choice::Measured { cache: Some(folder.clone()) });
+    let first = chosen(&measured());
+    assert!(first.starts_with("linear/forward"), "{first}");
+    let file = folder.join("variants.txt");
+    let kept = std::fs::read_to_string(&file).unwrap();
+    assert!(kept.lines().count() == 1 && kept.ends_with(&format!(" {first}\n")), "{kept}");
+    // Another process with another choice: its word holds, also against a measurement.
+    for other in ["linear/forward", "linear/forward_vec4"] {
+        std::fs::write(&file, kept.replace(&first, other)).unwrap();
+        assert_eq!(chosen(&measured()), other);
+    }
+    // What is not a choice is measured again; nothing but the file is left.
+    for broken in [kept.replace(&first, "linear/no_such_variant").into_bytes(), b"\xff\xfe {]".to_vec(), vec![]] {
+        std::fs::write(&file, broken).unwrap();
+        assert!(chosen(&measured()).starts_with("linear/forward"));
+        let again = std::fs::read_to_string(&file).unwrap();
+        assert!(again.lines().any(|line| line.starts_with(&kept[..16]) && !line.contains("no_such")), "{again}");
+    }
+    assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1);
+}
+
+#[test]
+fn other_texts_are_measured_anew() {
+    let dir = tempfile::tempdir().unwrap();
+    let measured = || gpu().with_choice(Choice::Measured { cache: Some(dir.path().into()) });
+    chosen(&measured());
+    chosen(&measured().with_sources(|kernel, variant| format!("{}\n// changed", kernel.source(variant))));
+    let kept = std::fs::read_to_string(dir.path().join("variants.txt")).unwrap();
+    assert_eq!(kept.lines().count(), 2, "{kept}");
+}
+
+#[test]
+fn a_choice_needs_no_cache() {
+    let dir = tempfile::tempdir().unwrap();
+    let occupied = dir.path().join("a file");
+    std::fs::write(&occupied, "in the way").unwrap();
+    for cache in [None, Some(occupied)] {
+        assert!(chosen(&gpu().with_choice(Choice::Measured { cache })).starts_with("linear/forward"));
+    }
+    assert_eq!(chosen(&gpu().with_choice(Choice::Named("forward_vec4".into()))), "linear/forward_vec4");
+    assert_eq!(chosen(&gpu().with_choice(Choice::Named("of another kernel".into()))), "linear/forward");
 }
 
 #[test]

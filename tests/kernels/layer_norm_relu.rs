@@ -16,6 +16,13 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_vec4", "+ 1e-5", "+ 1e-2"),
         ("forward_vec4", "params.features / 4u;", "params.features / 8u;"),
         ("forward_vec4", "f32(params.features);", "f32(n);"),
+        ("forward_subgroup", "+ 1e-5", "+ 1e-2"),
+        ("forward_subgroup", "max(value, vec4(0.0))", "value"),
+        ("forward_subgroup", "dot(value, vec4(1.0)), column", "dot(value, vec4(1.0)), 0u * column"),
+        ("forward_subgroup", "4u, n > 16u", "2u, n > 16u"),
+        ("forward_subgroup", "b + b.zwxy, per_row > 2u", "b + b.zwxy, per_row > 4u"),
+        ("forward_subgroup", "subgroupShuffleXor(a, 4u)", "subgroupShuffleXor(a, 2u)"),
+        ("forward_subgroup", "pick(rstd, lane % 8u * per_row)", "pick(rstd, lane % 8u)"),
     ],
 };
 
@@ -31,6 +38,12 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
         ("backward_input_vec4", "- mean_e", "+ mean_e"),
         ("backward_input_vec4", "dot(along, vec4(1.0))", "dot(along, vec4(1.0, 1.0, 1.0, 0.0))"),
         ("backward_input_vec4", "params.features / 4u + j", "params.features / 2u + j"),
+        ("backward_input_subgroup", "mean.a.y - x1", "mean.a.x - x1"),
+        ("backward_input_subgroup", "passes & vec4(column < params.features / 4u)", "passes"),
+        ("backward_input_subgroup", "row += 8u / per_row", "row += 8u"),
+        ("backward_input_subgroup", "octet + 5u / per_row", "octet"),
+        ("backward_input_subgroup", "subgroupShuffleXor(b, 1u)", "subgroupShuffleXor(b, 4u)"),
+        ("backward_input_subgroup", "dot(e6, x6)", "dot(e6, e6)"),
     ],
 };
 
@@ -43,6 +56,8 @@ pub static BACKWARD_AFFINE: KernelTest = KernelTest {
         ("backward_affine", "d_gamma += e * normalised", "d_gamma += e"),
         ("backward_affine", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
         ("backward_affine", "> 0.0)", "> 1.0)"),
+        ("backward_affine_vec4", "d_gamma += e * normalised", "d_gamma += e"),
+        ("backward_affine_vec4", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
     ],
 };
 
@@ -62,9 +77,19 @@ fn backward_affine_matches_reference() {
 }
 
 fn cases() -> Vec<Case> {
-    [(1, 3, false), (7, 17, true), (129, 30, false), (300, 5, true), (1, 4, true), (129, 64, true), (300, 8, false)]
-        .map(|(rows, features, accumulate)| case(rows, features, accumulate))
-        .into()
+    let odd = [(1, 3, false), (7, 17, true), (129, 30, false), (300, 5, true)];
+    // One, two, four and eight lanes to a row, and a row too long for them.
+    let even = [
+        (1, 4, true),
+        (300, 8, false),
+        (129, 36, true),
+        (65, 64, true),
+        (258, 100, false),
+        (33, 228, true),
+        (9, 256, false),
+        (5, 260, true),
+    ];
+    odd.into_iter().chain(even).map(|(rows, features, accumulate)| case(rows, features, accumulate)).collect()
 }
 
 /// Forward and both ways back: these need the statistics.

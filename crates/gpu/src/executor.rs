@@ -1,7 +1,9 @@
+use std::cell::OnceCell;
 use std::sync::Arc;
 
 use bytemuck::Pod;
 use srn_plan::{BufferId, Element, Executor, ExecutorError, Plan, StageId, Step};
+use srn_shaders::Variant;
 
 use crate::pipeline::{Pipeline, Slot};
 use crate::{Gpu, launch};
@@ -37,6 +39,8 @@ pub struct GpuExecutor {
 impl GpuExecutor {
     /// Makes buffers, pipelines and bind groups for `plan`, whose buffers may take `budget` bytes in all.
     ///
+    /// Where a step can run several variants of its kernel, the device's [`Choice`](crate::Choice) decides.
+    ///
     /// Fails where the plan exceeds the budget or a limit of the device, where a kernel does not compile, or a step needs
     /// more workgroups than the device allows.
     pub fn new(gpu: &Gpu, plan: Plan, budget: u64) -> Result<Self, ExecutorError> {
@@ -66,7 +70,13 @@ impl GpuExecutor {
         for stage in &plan.stages {
             let mut launches = Vec::with_capacity(stage.steps.len());
             for step in &stage.steps {
-                launches.push(launch(gpu, step, &buffers, &params.buffer, offsets.next().unwrap_or_default())?);
+                let bound: Vec<&wgpu::Buffer> = step.buffers.iter().map(|id| &buffers[id.index()]).collect();
+                let params = params.binding(step, offsets.next().unwrap_or_default());
+                let scratch = Scratch::default();
+                let variant = gpu.chooser().choose(gpu, step, |variant, extent| {
+                    launch(gpu, step, variant, extent, &scratch.instead_of_outputs(gpu, step, &bound)?, &params)
+                })?;
+                launches.push(launch(gpu, step, variant, step.extent, &bound, &params)?);
             }
             stages.push(launches);
         }
@@ -188,23 +198,26 @@ fn encode(launches: &[Launch], label: &str, encoder: &mut wgpu::CommandEncoder) 
     launches.iter().for_each(|launch| launch.dispatch(&mut pass));
 }
 
-fn launch(gpu: &Gpu, step: &Step, buffers: &[wgpu::Buffer], params: &wgpu::Buffer, offset: u64) -> Result<Launch, ExecutorError> {
-    let variant = launch::choose(step);
-    let label = format!("{}/{}", step.kernel.op, variant.name);
+/// Makes one dispatch: `bound` has a buffer for each binding of the kernel, `extent` is the step's or a part of it.
+fn launch(
+    gpu: &Gpu,
+    step: &Step,
+    variant: &Variant,
+    extent: [u32; 3],
+    bound: &[&wgpu::Buffer],
+    params: &wgpu::BufferBinding<'_>,
+) -> Result<Launch, ExecutorError> {
+    let label = step.kernel.label(variant);
     let most = gpu.device().limits().max_compute_workgroups_per_dimension;
-    let grid = launch::grid(step.extent, variant.tile, most).ok_or_else(|| ExecutorError::Device {
-        what: format!("{label}: extent {:?} in tiles of {:?} needs more than {most} workgroups", step.extent, variant.tile),
+    let grid = launch::grid(extent, variant.tile, most).ok_or_else(|| ExecutorError::Device {
+        what: format!("{label}: extent {extent:?} in tiles of {:?} needs more than {most} workgroups", variant.tile),
     })?;
     let pipeline = gpu.pipeline(step.kernel, variant)?;
     let entry = |&(binding, slot): &(u32, Slot)| wgpu::BindGroupEntry {
         binding,
         resource: match slot {
-            Slot::Params => wgpu::BindingResource::Buffer(wgpu::BufferBinding {
-                buffer: params,
-                offset,
-                size: wgpu::BufferSize::new(step.params.len() as u64),
-            }),
-            Slot::Buffer(position) => buffers[step.buffers[position].index()].as_entire_binding(),
+            Slot::Params => wgpu::BindingResource::Buffer(params.clone()),
+            Slot::Buffer(position) => bound[position].as_entire_binding(),
         },
     };
     let entries: Vec<_> = pipeline.slots.iter().map(entry).collect();
@@ -215,6 +228,33 @@ fn launch(gpu: &Gpu, step: &Step, buffers: &[wgpu::Buffer], params: &wgpu::Buffe
     Ok(Launch { pipeline, bind_group, grid, label })
 }
 
+/// Buffers that a step writes while its variants are measured, made when they are needed. What it reads are the plan's.
+#[derive(Default)]
+struct Scratch(OnceCell<Vec<Option<wgpu::Buffer>>>);
+
+impl Scratch {
+    fn instead_of_outputs<'a>(
+        &'a self,
+        gpu: &Gpu,
+        step: &Step,
+        bound: &[&'a wgpu::Buffer],
+    ) -> Result<Vec<&'a wgpu::Buffer>, ExecutorError> {
+        if self.0.get().is_none() {
+            let made = gpu.checked("making buffers to measure with", || {
+                let make = |buffer: &wgpu::Buffer| {
+                    let (label, size, usage) = (Some("measurement"), buffer.size(), wgpu::BufferUsages::STORAGE);
+                    gpu.device().create_buffer(&wgpu::BufferDescriptor { label, size, usage, mapped_at_creation: false })
+                };
+                let bindings = step.kernel.bindings.iter().zip(bound);
+                bindings.map(|(binding, buffer)| binding.written.then(|| make(buffer))).collect::<Vec<_>>()
+            })?;
+            let _ = self.0.set(made);
+        }
+        let made = self.0.get().into_iter().flatten();
+        Ok(made.zip(bound).map(|(scratch, &buffer)| scratch.as_ref().unwrap_or(buffer)).collect())
+    }
+}
+
 /// The parameters of all steps in one uniform buffer.
 struct Params {
     buffer: wgpu::Buffer,
@@ -223,6 +263,10 @@ struct Params {
 }
 
 impl Params {
+    fn binding(&self, step: &Step, offset: u64) -> wgpu::BufferBinding<'_> {
+        wgpu::BufferBinding { buffer: &self.buffer, offset, size: wgpu::BufferSize::new(step.params.len() as u64) }
+    }
+
     fn upload<'a>(gpu: &Gpu, steps: impl Iterator<Item = &'a Step>) -> Result<Params, ExecutorError> {
         let alignment = gpu.device().limits().min_uniform_buffer_offset_alignment as usize;
         let (mut bytes, mut offsets) = (Vec::new(), Vec::new());

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use srn_plan::{ExecutorError, Kernel};
 use srn_shaders::Variant;
 
+use crate::choice::{Choice, Chooser};
 use crate::pipeline::Pipeline;
 
 /// An adapter of this machine.
@@ -102,6 +103,7 @@ pub struct Gpu {
     queue: wgpu::Queue,
     shared: Arc<Shared>,
     sources: Arc<Sources>,
+    chooser: Arc<Chooser>,
 }
 
 impl Gpu {
@@ -150,12 +152,26 @@ impl Gpu {
     /// The caller's error handlers stay as they are: errors caused by calls of this crate are caught in error scopes.
     pub fn from_device(device: wgpu::Device, queue: wgpu::Queue) -> Gpu {
         tracing::debug!(adapter = %AdapterInfo::from(device.adapter_info()), features = ?device.features(), "device");
-        Gpu { device, queue, shared: Arc::default(), sources: Arc::new(Kernel::source) }
+        Gpu { device, queue, shared: Arc::default(), sources: Arc::new(Kernel::source), chooser: Arc::default() }
     }
 
     /// The same device, with WGSL texts from `sources` in place of [`Kernel::source`]: kernels in development, planted faults.
     pub fn with_sources(&self, sources: impl Fn(&Kernel, &Variant) -> String + Send + Sync + 'static) -> Gpu {
-        Gpu { sources: Arc::new(sources), ..self.clone() }
+        Gpu { sources: Arc::new(sources), chooser: Arc::new(self.chooser.afresh()), ..self.clone() }
+    }
+
+    /// The same device, with the variants of kernels chosen in this way.
+    pub fn with_choice(&self, choice: Choice) -> Gpu {
+        Gpu { chooser: Arc::new(Chooser::new(choice)), ..self.clone() }
+    }
+
+    pub(crate) fn chooser(&self) -> &Chooser {
+        &self.chooser
+    }
+
+    /// Whether kernels may use subgroups, and count on eight lanes.
+    pub(crate) fn has_subgroups(&self) -> bool {
+        self.device.features().contains(wgpu::Features::SUBGROUP) && self.device.adapter_info().subgroup_min_size >= 8
     }
 
     /// The adapter behind the device.
@@ -188,9 +204,14 @@ impl Gpu {
         }
     }
 
+    /// The WGSL text of a kernel variant.
+    pub(crate) fn source(&self, kernel: &Kernel, variant: &Variant) -> String {
+        (self.sources)(kernel, variant)
+    }
+
     /// The pipeline of a kernel variant, compiled on first use.
     pub(crate) fn pipeline(&self, kernel: &Kernel, variant: &Variant) -> Result<Arc<Pipeline>, ExecutorError> {
-        let text = (self.sources)(kernel, variant);
+        let text = self.source(kernel, variant);
         let mut pipelines = lock(&self.shared.pipelines);
         if let Some(pipeline) = pipelines.get(&text) {
             return Ok(pipeline.clone());
@@ -221,7 +242,7 @@ impl Gpu {
     }
 
     /// wgpu panics in `poll`, where it holds no lock, when the driver reports a lost device.
-    fn poll(&self, poll: wgpu::PollType) -> Result<(), String> {
+    pub(crate) fn poll(&self, poll: wgpu::PollType) -> Result<(), String> {
         match catch_unwind(AssertUnwindSafe(|| self.device.poll(poll))) {
             Ok(status) => status.map(drop).map_err(|error| error.to_string()),
             Err(_) => Err("the device was lost".into()),
@@ -261,7 +282,7 @@ impl fmt::Debug for Gpu {
 }
 
 /// A panic elsewhere leaves these values whole: they are replaced, never half written.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 

@@ -1,30 +1,13 @@
-//! How a step becomes a dispatch: which variant of its kernel, how many workgroups, in which submission.
+//! How a step becomes a dispatch: how many workgroups, in which submission.
 
 use std::ops::Range;
 
 use srn_plan::Step;
-use srn_shaders::{Requirement, Variant};
 
 /// Most matrix work of one submission, so that no driver's watchdog takes it for a hang (20 GFLOP: a second on a slow device).
 const MOST_FLOPS: u64 = 20_000_000_000;
 /// Most steps of one submission. Two timestamps each fit a query set.
 pub(crate) const MOST_STEPS: usize = 2000;
-
-/// The variant that a step runs: the last one whose requirement holds. (To choose by measuring, measure here.)
-pub(crate) fn choose(step: &Step) -> &'static Variant {
-    let usable = |variant: &&Variant| match variant.requires {
-        Requirement::Nothing => true,
-        Requirement::FeaturesMultipleOf4 => widths(step).all(|width| width % 4 == 0),
-    };
-    step.kernel.variants.iter().rfind(usable).unwrap_or(&step.kernel.variants[0])
-}
-
-/// The parameters of a step that a vectorised kernel divides by four.
-fn widths(step: &Step) -> impl Iterator<Item = u32> {
-    let names = ["features", "in_features", "out_features", "first_out", "end_out"];
-    let fields = step.kernel.params.fields.iter().filter(move |field| names.contains(&field.0));
-    fields.map(|&(_, _, offset)| bytemuck::pod_read_unaligned(&step.params[offset..offset + 4]))
-}
 
 /// Workgroups that cover `extent`, or none where a dimension exceeds `most`. One-dimensional grids are folded into y: the
 /// kernels number their workgroups with `flat_index`.

@@ -7,6 +7,7 @@
 //! Errors of wgpu never panic: what a call causes comes back from that call, what the device reports later (a lost device)
 //! from the next one, and an executor with a failed run answers every read with that failure.
 
+mod choice;
 mod executor;
 mod gpu;
 mod launch;
@@ -14,6 +15,7 @@ mod pipeline;
 mod profile;
 pub mod raster;
 
+pub use choice::Choice;
 pub use executor::GpuExecutor;
 pub use gpu::{AdapterInfo, Gpu, OpenError, adapters};
 pub use profile::KernelTime;

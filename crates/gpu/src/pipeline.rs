@@ -23,7 +23,7 @@ pub(crate) struct Pipeline {
 
 impl Pipeline {
     pub fn new(gpu: &Gpu, kernel: &Kernel, variant: &Variant, text: &str) -> Result<Self, ExecutorError> {
-        let label = format!("{}/{}", kernel.op, variant.name);
+        let label = kernel.label(variant);
         tracing::debug!(kernel = label, "compile");
         let slots = reflect(kernel, text).map_err(|what| ExecutorError::Device { what: format!("{label}: {what}") })?;
         let entries: Vec<_> = slots
@@ -51,7 +51,11 @@ impl Pipeline {
                 layout: Some(&pipeline_layout),
                 module: &module,
                 entry_point: None,
-                compilation_options: Default::default(),
+                // Our kernels write what they read of it.
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    zero_initialize_workgroup_memory: false,
+                    ..Default::default()
+                },
                 cache: None,
             });
             Pipeline { compute, layout, slots: slots.iter().map(|&(binding, slot, _)| (binding, slot)).collect() }

@@ -1,8 +1,10 @@
 use std::collections::BTreeMap;
+use std::time::Instant;
 
 use srn_plan::{Executor, ExecutorError, StageId};
 
-use crate::{GpuExecutor, launch};
+use crate::executor::Launch;
+use crate::{Gpu, GpuExecutor, launch};
 
 /// Time on the device of all steps of a stage that ran one kernel variant.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,7 +31,8 @@ impl GpuExecutor {
         self.attempt(|this| {
             let mut times: BTreeMap<&str, KernelTime> = BTreeMap::new();
             for part in launch::submissions(&this.plan().stage(stage).steps) {
-                let seconds = this.timed(stage, part.clone())?;
+                let launches: Vec<&Launch> = this.launches(stage)[part.clone()].iter().collect();
+                let seconds = this.gpu().time(&launches)?;
                 for (index, seconds) in part.zip(seconds) {
                     let label = this.launches(stage)[index].label.as_str();
                     let new = || KernelTime { label: label.into(), steps: 0, seconds: 0.0, flops: 0 };
@@ -44,12 +47,18 @@ impl GpuExecutor {
             Ok(times)
         })
     }
+}
 
-    /// Seconds of each step of one submission.
-    fn timed(&self, stage: StageId, part: std::ops::Range<usize>) -> Result<Vec<f64>, ExecutorError> {
-        let (device, queue) = (self.gpu().device(), self.gpu().queue());
-        let count = 2 * part.len() as u32;
-        let ticks = self.gpu().checked("timing", || {
+impl Gpu {
+    /// Seconds that each of these takes in one submission; by the caller's clock, and a submission each, on a device without
+    /// timestamps.
+    pub(crate) fn time(&self, launches: &[&Launch]) -> Result<Vec<f64>, ExecutorError> {
+        if !self.device().features().contains(wgpu::Features::TIMESTAMP_QUERY) {
+            return launches.iter().map(|launch| self.time_from_outside(launch)).collect();
+        }
+        let (device, queue) = (self.device(), self.queue());
+        let count = 2 * launches.len() as u32;
+        let ticks = self.checked("timing", || {
             let ty = wgpu::QueryType::Timestamp;
             let query_set = device.create_query_set(&wgpu::QuerySetDescriptor { label: Some("steps"), ty, count });
             let ticks = device.create_buffer(&wgpu::BufferDescriptor {
@@ -59,7 +68,7 @@ impl GpuExecutor {
                 mapped_at_creation: false,
             });
             let mut encoder = device.create_command_encoder(&Default::default());
-            for (index, launch) in self.launches(stage)[part].iter().enumerate() {
+            for (index, launch) in launches.iter().enumerate() {
                 let timestamp_writes = Some(wgpu::ComputePassTimestampWrites {
                     query_set: &query_set,
                     beginning_of_pass_write_index: Some(2 * index as u32),
@@ -72,9 +81,21 @@ impl GpuExecutor {
             queue.submit([encoder.finish()]);
             ticks
         })?;
-        let view = self.gpu().download("timing", &ticks, 8 * u64::from(count))?;
+        let view = self.download("timing", &ticks, 8 * u64::from(count))?;
         let ticks: Vec<u64> = bytemuck::pod_collect_to_vec(&view[..]);
         let period = f64::from(queue.get_timestamp_period()) * 1e-9;
         Ok(ticks.chunks_exact(2).map(|pair| pair[1].saturating_sub(pair[0]) as f64 * period).collect())
+    }
+
+    fn time_from_outside(&self, launch: &Launch) -> Result<f64, ExecutorError> {
+        let begin = Instant::now();
+        let waited = self.checked("timing", || {
+            let mut encoder = self.device().create_command_encoder(&Default::default());
+            launch.dispatch(&mut encoder.begin_compute_pass(&Default::default()));
+            self.queue().submit([encoder.finish()]);
+            self.poll(wgpu::PollType::wait_indefinitely())
+        })?;
+        waited.map_err(|what| ExecutorError::Device { what: format!("timing: {what}") })?;
+        Ok(begin.elapsed().as_secs_f64())
     }
 }

@@ -11,7 +11,8 @@ use crate::Error;
 
 /// Memory that a plan may take on the CPU where the user sets no budget, in bytes.
 const CPU_BUDGET: u64 = 2 << 30;
-/// Values of one layer of a tile on the CPU: large enough to keep the threads busy, small enough to stay in the caches.
+/// Values of one layer of a tile on the CPU, by this executor or by a software adapter: large enough to keep the threads
+/// busy, small enough to stay in the caches.
 const CPU_TILE_VALUES: u32 = 1 << 18;
 /// Rows of a tile on a GPU: enough to fill a large one.
 const GPU_TILE_ROWS: u32 = 32_768;
@@ -114,8 +115,8 @@ impl Engine {
         build: impl Fn(&mut Builder, u32) -> Result<T, PlanError>,
     ) -> Result<(Plan, T), Error> {
         let preferred = self.tile_rows.unwrap_or(match &self.kind {
-            Kind::Gpu(_) => GPU_TILE_ROWS,
-            Kind::Cpu | Kind::CpuF64 => CPU_TILE_VALUES / features.max(1),
+            Kind::Gpu(gpu) if !gpu.adapter().is_software => GPU_TILE_ROWS,
+            Kind::Gpu(_) | Kind::Cpu | Kind::CpuF64 => CPU_TILE_VALUES / features.max(1),
         });
         let mut tile_rows = rows.min(preferred).max(1);
         loop {

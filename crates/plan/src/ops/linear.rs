@@ -82,6 +82,11 @@ impl Layer {
     }
 }
 
+/// Most loop iterations of an invocation that sums over `terms`: one for each and for each sixteen, and some to store.
+fn loops(terms: u32) -> u64 {
+    u64::from(terms) + u64::from(terms) / 16 + 64
+}
+
 /// `y [rows, out] (+)= x [rows, in] Wᵀ + b`.
 pub fn forward(
     b: &mut Builder,
@@ -100,7 +105,7 @@ pub fn forward(
         output(y, size([rows.count(), layer.out_features]), accumulate),
     ];
     let extent = [rows.rows_per_group, layer.out_features, rows.groups];
-    let loops = u64::from(layer.in_features) + 64;
+    let loops = loops(layer.in_features);
     b.step(&LINEAR_FORWARD, layer.params(rows, accumulate), &args, extent, loops, layer.flops(rows))
 }
 
@@ -126,9 +131,9 @@ pub fn backward_input(
         ];
         let params = LinearParams { first_out, end_out, ..layer.params(rows, accumulate) };
         let extent = [rows.rows_per_group, layer.in_features, rows.groups];
-        let outs = u64::from(end_out - first_out);
-        let flops = 2 * u64::from(rows.count()) * u64::from(layer.in_features) * outs;
-        b.step(&LINEAR_BACKWARD_INPUT, params, &args, extent, outs + 64, flops)?;
+        let outs = end_out - first_out;
+        let flops = 2 * u64::from(rows.count()) * u64::from(layer.in_features) * u64::from(outs);
+        b.step(&LINEAR_BACKWARD_INPUT, params, &args, extent, loops(outs), flops)?;
     }
     Ok(())
 }
@@ -163,7 +168,7 @@ pub fn backward_weight(
     let chunk_rows = CHUNK_ROWS.min(rows.rows_per_group);
     let params = LinearParams { chunk_rows, chunks, ..layer.params(rows, direct && accumulate) };
     let extent = [layer.out_features, layer.in_features, rows.groups * chunks];
-    b.step(&LINEAR_BACKWARD_WEIGHT, params, &args, extent, u64::from(chunk_rows) + 64, layer.flops(rows))?;
+    b.step(&LINEAR_BACKWARD_WEIGHT, params, &args, extent, loops(chunk_rows), layer.flops(rows))?;
     if direct {
         return Ok(());
     }

@@ -1,0 +1,224 @@
+//! Which variant of its kernel a step runs: measured once for a device, a text and a shape, then kept in a file.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::time::SystemTime;
+use std::{env, fs, io};
+
+use srn_plan::{ExecutorError, Step};
+use srn_shaders::{Requirement, Variant};
+
+use crate::Gpu;
+use crate::executor::Launch;
+use crate::gpu::lock;
+
+/// Where choices are kept: a line for each, a hash and `op/variant`.
+const FILE: &str = "variants.txt";
+
+/// How the variants of kernels are chosen.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Choice {
+    /// The fastest one: measured when a plan first needs it, on buffers of the measurement's own, and kept.
+    ///
+    /// Variants add in different orders, so results repeat bit for bit as long as the choice does. The file sees to that
+    /// from one process to the next; without one, each device that is opened measures anew.
+    Measured {
+        /// The folder of the file `variants.txt`. One that cannot be read or written is as good as none.
+        cache: Option<PathBuf>,
+    },
+    /// The variant of this name where a kernel has it and size and device allow it, else the plain form: for tests.
+    Named(String),
+}
+
+impl Default for Choice {
+    /// Measured, and kept in `sigma-srn` of the user's cache directory: `$XDG_CACHE_HOME`, `%LOCALAPPDATA%` or `~/.cache`.
+    fn default() -> Self {
+        let set = |name| env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+        let base = set("XDG_CACHE_HOME").or_else(|| set("LOCALAPPDATA")).or_else(|| Some(set("HOME")?.join(".cache")));
+        Choice::Measured { cache: base.map(|base| base.join("sigma-srn")) }
+    }
+}
+
+/// The choice, and what it has been so far.
+#[derive(Debug, Default)]
+pub(crate) struct Chooser {
+    choice: Choice,
+    chosen: Mutex<HashMap<Shape, &'static Variant>>,
+}
+
+/// A kernel, the widths of a step, and its extent up to the next power of two.
+type Shape = (&'static str, Vec<u32>);
+
+impl Chooser {
+    pub fn new(choice: Choice) -> Self {
+        Chooser { choice, chosen: Mutex::default() }
+    }
+
+    /// The same choice with nothing chosen yet: for other texts.
+    pub fn afresh(&self) -> Self {
+        Chooser::new(self.choice.clone())
+    }
+
+    /// The variant for a step; `launch` makes the step with a variant and a part of its extent ready to be timed.
+    pub fn choose(
+        &self,
+        gpu: &Gpu,
+        step: &Step,
+        launch: impl Fn(&Variant, [u32; 3]) -> Result<Launch, ExecutorError>,
+    ) -> Result<&'static Variant, ExecutorError> {
+        let shape = (step.kernel.name, widths(step).chain(step.extent.map(u32::next_power_of_two)).collect());
+        // Held while measuring: two plans that are built at once would spoil each other's times.
+        let mut chosen = lock(&self.chosen);
+        if let Some(variant) = chosen.get(&shape) {
+            return Ok(variant);
+        }
+        let usable: Vec<&'static Variant> = step.kernel.variants.iter().filter(|variant| is_usable(variant, step, gpu)).collect();
+        let variant = match &self.choice {
+            _ if usable.len() == 1 => usable[0],
+            Choice::Named(name) => usable.iter().find(|variant| variant.name == name).unwrap_or(&usable[0]),
+            Choice::Measured { cache: None } => measure(gpu, step, &usable, launch)?,
+            Choice::Measured { cache: Some(folder) } => {
+                let key = key(gpu, step, &shape, &usable);
+                let kept = || {
+                    let label = read(folder).ok()?.remove(&key)?;
+                    usable.iter().copied().find(|variant| step.kernel.label(variant) == label)
+                };
+                match kept() {
+                    Some(variant) => variant,
+                    None => {
+                        let fastest = measure(gpu, step, &usable, launch)?;
+                        // What another process has chosen meanwhile holds for both.
+                        kept().unwrap_or_else(|| {
+                            if let Err(error) = keep(folder, &key, step.kernel.label(fastest)) {
+                                tracing::debug!(%error, ?folder, "the choice cannot be kept");
+                            }
+                            fastest
+                        })
+                    }
+                }
+            }
+        };
+        chosen.insert(shape, variant);
+        Ok(variant)
+    }
+}
+
+fn is_usable(variant: &Variant, step: &Step, gpu: &Gpu) -> bool {
+    variant.requires.iter().all(|requirement| match requirement {
+        Requirement::FeaturesMultipleOf4 => widths(step).all(|width| width % 4 == 0),
+        Requirement::FeaturesAtMost256 => widths(step).all(|width| width <= 256),
+        Requirement::Subgroups => gpu.has_subgroups(),
+    })
+}
+
+/// The parameters of a step that are numbers of features.
+fn widths(step: &Step) -> impl Iterator<Item = u32> {
+    let names = ["features", "in_features", "out_features", "first_out", "end_out"];
+    let fields = step.kernel.params.fields.iter().filter(move |field| names.contains(&field.0));
+    fields.map(|&(_, _, offset)| bytemuck::pod_read_unaligned(&step.params[offset..offset + 4]))
+}
+
+/// What a measurement holds for: the device, the shape and the texts.
+fn key(gpu: &Gpu, step: &Step, shape: &Shape, usable: &[&Variant]) -> String {
+    let texts: Vec<String> = usable.iter().map(|variant| gpu.source(step.kernel, variant)).collect();
+    format!("{:016x}", fnv(format!("{} {shape:?} {texts:?}", gpu.adapter()).as_bytes()))
+}
+
+/// Fowler, Noll and Vo's hash 1a: the standard library's may change with its version.
+fn fnv(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3))
+}
+
+/// Work that a software adapter is timed on, in floating-point operations: a millisecond or a few, which other programs
+/// leave alone more often than not. A real GPU, which needs many rows to show what it can, is timed on the whole.
+const SAMPLE: u64 = 100_000_000;
+/// Most times that a variant is timed.
+const MOST_ROUNDS: usize = 20;
+/// Times that differ by less are the same.
+const SAME: f64 = 1.1;
+
+/// A variant with its times so far, the two shortest of them.
+struct Candidate {
+    variant: &'static Variant,
+    launch: Launch,
+    best: f64,
+    second: f64,
+}
+
+impl Candidate {
+    fn add(&mut self, seconds: f64) {
+        self.second = self.second.min(seconds.max(self.best));
+        self.best = self.best.min(seconds);
+    }
+
+    /// Other programs only ever make a time longer, and hardly ever twice by the same.
+    fn is_settled(&self) -> bool {
+        self.second <= SAME * self.best
+    }
+}
+
+fn measure(
+    gpu: &Gpu,
+    step: &Step,
+    usable: &[&'static Variant],
+    launch: impl Fn(&Variant, [u32; 3]) -> Result<Launch, ExecutorError>,
+) -> Result<&'static Variant, ExecutorError> {
+    let (mut extent, mut flops) = (step.extent, step.flops);
+    while gpu.adapter().is_software && flops > SAMPLE {
+        // The rows of a group, or the groups; both for sums over rows.
+        let longest = if extent[0] >= extent[2] { 0 } else { 2 };
+        extent[longest] = extent[longest].div_ceil(2);
+        flops /= 2;
+    }
+    let mut candidates = Vec::new();
+    for &variant in usable {
+        match launch(variant, extent) {
+            Ok(launch) => candidates.push(Candidate { variant, launch, best: f64::INFINITY, second: f64::INFINITY }),
+            Err(error) => tracing::debug!(%error, "not a candidate"),
+        }
+    }
+    if let [] | [_] = candidates[..] {
+        return Ok(candidates.first().map_or(usable[0], |only| only.variant));
+    }
+    // The first time is that of compiling.
+    gpu.time(&candidates.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
+    for _ in 0..MOST_ROUNDS {
+        let best = candidates.iter().map(|candidate| candidate.best).fold(f64::INFINITY, f64::min);
+        let is_open = |candidate: &&mut Candidate| !(candidate.is_settled() && candidate.best > SAME * best);
+        let mut open: Vec<&mut Candidate> = candidates.iter_mut().filter(is_open).collect();
+        if open.len() <= 1 || (best.is_finite() && open.iter().all(|candidate| candidate.is_settled())) {
+            break;
+        }
+        let seconds = gpu.time(&open.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
+        open.iter_mut().zip(seconds).for_each(|(candidate, seconds)| candidate.add(seconds));
+    }
+    let fastest = candidates.iter().min_by(|a, b| a.best.total_cmp(&b.best)).map_or(usable[0], |fastest| fastest.variant);
+    let times = candidates.iter().map(|candidate| format!("{} {:.3} ms", candidate.variant.name, 1e3 * candidate.best));
+    tracing::debug!(
+        kernel = step.kernel.name,
+        widths = ?widths(step).collect::<Vec<_>>(),
+        extent = ?step.extent,
+        "chose {}: {}", fastest.name, times.collect::<Vec<_>>().join(", ")
+    );
+    Ok(fastest)
+}
+
+/// The labels `op/variant` by their keys; lines that are none are left out.
+fn read(folder: &Path) -> io::Result<BTreeMap<String, String>> {
+    let text = fs::read_to_string(folder.join(FILE))?;
+    let lines = text.lines().filter_map(|line| line.split_once(' '));
+    Ok(lines.map(|(key, label)| (key.to_owned(), label.to_owned())).collect())
+}
+
+/// Adds a line to the file, which is written whole or not at all: another process may be reading.
+fn keep(folder: &Path, key: &str, label: String) -> io::Result<()> {
+    let mut known = read(folder).unwrap_or_default();
+    known.insert(key.to_owned(), label);
+    let lines: String = known.iter().map(|(key, label)| format!("{key} {label}\n")).collect();
+    let nanoseconds = SystemTime::UNIX_EPOCH.elapsed().map_or(0, |time| time.as_nanos());
+    let new = folder.join(format!("{FILE}.{}.{nanoseconds}", std::process::id()));
+    fs::create_dir_all(folder)?;
+    fs::write(&new, lines)?;
+    fs::rename(&new, folder.join(FILE)).inspect_err(|_| drop(fs::remove_file(&new)))
+}
