@@ -56,8 +56,8 @@ impl Default for Options {
         let phases = vec![
             Phase { steps: 0, stride: 4, keep: usize::MAX },
             Phase { steps: 8, stride: 4, keep: 16 },
-            Phase { steps: 10, stride: 2, keep: 4 },
-            Phase { steps: 10, stride: 1, keep: 2 },
+            Phase { steps: 8, stride: 2, keep: 4 },
+            Phase { steps: 8, stride: 1, keep: 2 },
         ];
         Options { method: Method::LevenbergMarquardt { soft: 0.3 }, phases, seed: 0 }
     }
