@@ -195,8 +195,8 @@ fn bad_calls_end_with_2_and_one_line() {
     for (args, words) in [
         (format!("fit --data {TRAIN} --out {used} {TINY}"), &["used", "not empty", "--resume"][..]),
         (format!("fit --data {TRAIN}/nothing --out {run}"), &["nothing"]),
-        (format!("fit --data {set} --out {run}"), &["cup", "intrinsics.txt"]),
-        (format!("fit --data {TRAIN} --validation {set} --out {run} --side 16 --views 1"), &["intrinsics.txt"]),
+        (format!("fit --data {set} --out {run}"), &["cup", "rgb", "none"]),
+        (format!("fit --data {TRAIN} --validation {set} --out {run} --side 16 --views 1"), &["cup", "rgb", "none"]),
         (format!("fit --data {TRAIN}/seat --validation {TEST} --out {run} --side 16"), &["--validation", "bucket"]),
         (format!("fit --data {TRAIN} --out {run} --side 8 --rays 65"), &["--rays 65", "64 pixels"]),
         (format!("fit --data {TRAIN} --out {run} --hidden 0"), &["--hidden"]),
