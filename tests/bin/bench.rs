@@ -17,11 +17,17 @@ const SIDE: u32 = 64;
 const RAYS: u32 = SIDE * SIDE;
 /// Hypotheses of a pose step, as in the paper's measurement.
 const BATCH: u32 = 5;
+const ADAM: Method = Method::Adam { loss: Loss::Mae, learning_rate: 0.01 };
+/// Bytes for a training by width: an eighth of the default; at the paper's width half, since parameters, gradients and Adam's
+/// moments alone take 0.9 GB.
+const SMALL_BUDGETS: [(u32, u64); 2] = [(64, 256 << 20), (256, 1 << 30)];
+/// Hypotheses and side of the image, from one to the other end of what is asked for.
+const SCALING: [(u32, u32); 8] = [(5, 16), (5, 32), (5, 64), (5, 128), (1, 32), (5, 32), (24, 32), (120, 32)];
 
 /// One line of the table.
 #[derive(Clone, Debug)]
 struct Row {
-    what: &'static str,
+    what: String,
     width: u32,
     executor: &'static str,
     seconds: f64,
@@ -31,6 +37,20 @@ struct Row {
     of_sgemm: f64,
     bytes: u64,
     budget: u64,
+}
+
+/// One line of the table of costs against work: a pose step of Adam at width 64.
+struct Scaling {
+    executor: &'static str,
+    hypotheses: u32,
+    side: u32,
+    seconds: f64,
+}
+
+impl Scaling {
+    fn rays(&self) -> u32 {
+        self.hypotheses * self.side * self.side
+    }
 }
 
 /// Time of one kernel in one run of a stage.
@@ -62,7 +82,7 @@ fn run() -> Result<()> {
     }
     let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
     let (quick, json) = (has("--quick"), has("--json"));
-    let runs = if quick { 1 } else { 5 };
+    let runs = if quick { 1 } else { 3 };
 
     let mut engines = vec![Engine::cpu()];
     match Gpu::open(None) {
@@ -71,29 +91,48 @@ fn run() -> Result<()> {
     }
     let hardware = hardware(&engines);
     eprintln!("{hardware}");
-    let (mut rows, mut kernels, mut ceilings) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut rows, mut kernels, mut ceilings, mut scaling) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     // The small nets first: the kernels of the large ones are compiled then.
     for width in if quick { vec![64] } else { vec![64, 256] } {
         let model = model(width)?;
         for engine in &engines {
             let mut bench = Bench { engine, model: &model, runs, ceilings: &mut ceilings };
-            let (row, profile) = bench.pose_step()?;
+            let (row, mut descent) = bench.pose_step(ADAM, BATCH, SIDE)?;
+            kernels.extend(profile(&mut descent, width, name(engine))?);
+            drop(descent);
+            let before = rows.len();
             rows.push(row);
-            kernels.extend(profile);
+            if width == 64 {
+                rows.push(bench.pose_step(Method::LevenbergMarquardt { soft: 0.3 }, BATCH, SIDE)?.0);
+            }
+            // Long, and of two budgets.
+            bench.runs = 1;
             rows.push(bench.training_step()?);
+            for (_, budget) in SMALL_BUDGETS.into_iter().filter(|small| small.0 == width && !quick) {
+                let engine = engine.clone().with_budget(budget);
+                let mut bench = Bench { engine: &engine, model: &model, runs: 1, ceilings: &mut ceilings };
+                rows.push(bench.training_step()?);
+            }
+            let mut bench = Bench { engine, model: &model, runs, ceilings: &mut ceilings };
             rows.push(bench.picture()?);
-            rows.iter().rev().take(3).rev().filter(|row| row.width == width).for_each(|row| eprintln!("{}", line(row)));
+            rows[before..].iter().for_each(|row| eprintln!("{}", line(row)));
+            if width == 64 && !quick {
+                for (hypotheses, side) in SCALING {
+                    let (row, _) = bench.pose_step(ADAM, hypotheses, side)?;
+                    scaling.push(Scaling { executor: row.executor, hypotheses, side, seconds: row.seconds });
+                }
+            }
         }
     }
     let ceiling = median(&mut ceilings);
     if json {
-        println!("{:#}", as_json(&hardware, ceiling, &rows, &kernels));
+        println!("{:#}", as_json(&hardware, ceiling, &rows, &scaling, &kernels));
     } else {
-        println!("{}", report(&hardware, ceiling, &rows, &kernels));
+        println!("{}", report(&hardware, ceiling, &rows, &scaling, &kernels));
     }
     if has("--write") {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/performance.md");
-        let text = report(&hardware, ceiling, &rows, &kernels);
+        let text = report(&hardware, ceiling, &rows, &scaling, &kernels);
         let new = between::replace(&std::fs::read_to_string(&path)?, "bench", &text)?;
         std::fs::write(&path, new)?;
     }
@@ -111,15 +150,17 @@ fn name(engine: &Engine) -> &'static str {
     if engine.as_gpu().is_some() { "gpu" } else { "cpu" }
 }
 
-fn intrinsics() -> Intrinsics {
-    Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.0 }
+fn intrinsics(side: u32) -> Intrinsics {
+    let side = f64::from(side);
+    Intrinsics { fx: 1.1625 * side, fy: 1.1625 * side, cx: 0.5 * side, cy: 0.5 * side, pixel_center: 0.0 }
 }
 
-fn rays(images: u32, pixels: u32) -> Rays {
+/// `pixels` of each of `images` pictures of `side` pixels.
+fn rays(images: u32, side: u32, pixels: u32) -> Rays {
     let mut random = stream(0, 0);
     let mut rays = Rays::default();
-    for camera in camera::fixed24(1.3).iter().take(images as usize) {
-        rays.push(camera, &intrinsics(), pixel_grid(SIDE, SIDE, 1).take(pixels as usize), &mut random);
+    for camera in camera::fixed24(1.3).iter().cycle().take(images as usize) {
+        rays.push(camera, &intrinsics(side), pixel_grid(side, side, 1).take(pixels as usize), &mut random);
     }
     rays
 }
@@ -150,16 +191,18 @@ impl Bench<'_> {
         Ok((median(&mut seconds), median(&mut rates)))
     }
 
-    fn row(&self, what: &'static str, (seconds, ceiling): (f64, f64), flops: u64, bytes: u64) -> Row {
+    fn row(&self, what: String, (seconds, ceiling): (f64, f64), flops: u64, bytes: u64) -> Row {
         let (width, executor, budget) = (self.model.layout.features(), name(self.engine), self.engine.budget());
         Row { what, width, executor, seconds, flops, of_sgemm: flops as f64 / seconds / ceiling, bytes, budget }
     }
 
-    fn pose_step(&mut self) -> Result<(Row, Vec<KernelRow>)> {
-        let shape = Shape { hypotheses: BATCH, width: SIDE, height: SIDE, instances: 1 };
-        let mut descent = Descent::new(self.engine, self.model, shape, Method::Adam { loss: Loss::Mae, learning_rate: 0.01 })?;
-        descent.set_targets(&[0], &[0; BATCH as usize], &rays(BATCH, RAYS), &target(3 * BATCH * RAYS))?;
-        let poses: Vec<Pose6> = camera::fixed24(1.3).iter().take(BATCH as usize).map(Pose6::from_matrix).collect();
+    fn pose_step(&mut self, method: Method, hypotheses: u32, side: u32) -> Result<(Row, Descent)> {
+        let pixels = side * side;
+        let shape = Shape { hypotheses, width: side, height: side, instances: 1 };
+        let mut descent = Descent::new(self.engine, self.model, shape, method)?;
+        let target = target(3 * hypotheses * pixels);
+        descent.set_targets(&[0], &vec![0; hypotheses as usize], &rays(hypotheses, side, pixels), &target)?;
+        let poses = camera::fixed24(1.3).iter().cycle().take(hypotheses as usize).map(Pose6::from_matrix).collect::<Vec<_>>();
         descent.set_poses(&poses)?;
         let time = self.measure(|| {
             descent.evaluate()?;
@@ -167,16 +210,16 @@ impl Bench<'_> {
             descent.losses()?;
             Ok(())
         })?;
-        let row = self.row("pose step, 5 hypotheses", time, descent.flops_per_step(), descent.bytes());
-        Ok((row, profile(&mut descent, self.model.layout.features(), name(self.engine))?))
+        let name = if matches!(method, Method::Adam { .. }) { "Adam" } else { "Levenberg–Marquardt" };
+        let what = format!("pose step, {name}, {hypotheses} hypotheses");
+        Ok((self.row(what, time, descent.flops_per_step(), descent.bytes()), descent))
     }
 
     fn training_step(&mut self) -> Result<Row> {
         const IMAGES: u32 = 10;
-        const PIXELS: u32 = 512;
-        let mut trainer = Trainer::new(self.engine, self.model.clone(), Train::Everything, IMAGES, PIXELS)?;
+        let mut trainer = Trainer::new(self.engine, self.model.clone(), Train::Everything, IMAGES, RAYS)?;
         let instances = (0..IMAGES).map(|image| image % 9).collect();
-        let batch = TrainingBatch { instances, rays: rays(IMAGES, PIXELS), target_rgb: target(3 * IMAGES * PIXELS) };
+        let batch = TrainingBatch { instances, rays: rays(IMAGES, SIDE, RAYS), target_rgb: target(3 * IMAGES * RAYS) };
         let time = self.measure(|| {
             trainer.step(&batch, 1e-4)?;
             trainer.losses()?;
@@ -185,18 +228,18 @@ impl Bench<'_> {
         let plan = trainer.executor().plan();
         let flops = plan.stages.iter().flat_map(|stage| &stage.steps).map(|step| step.flops).sum();
         let bytes = plan.bytes();
-        Ok(self.row("training step, 10 × 512 rays", time, flops, bytes))
+        Ok(self.row("training step, 10 images".into(), time, flops, bytes))
     }
 
     fn picture(&mut self) -> Result<Row> {
         let mut renderer = Renderer::new(self.engine, self.model, 1, SIDE, SIDE)?;
-        let cameras = [(camera::fixed24(1.3)[3], intrinsics())];
+        let cameras = [(camera::fixed24(1.3)[3], intrinsics(SIDE))];
         let time = self.measure(|| {
             renderer.render(&[0], &cameras, 0)?;
             Ok(())
         })?;
         // A fifth of a pose step is one picture forward and backward; only its time is reported.
-        Ok(self.row("picture", time, 0, 0))
+        Ok(self.row("picture".into(), time, 0, 0))
     }
 }
 
@@ -269,7 +312,7 @@ fn date() -> String {
 
 fn line(row: &Row) -> String {
     let seconds = if row.seconds < 0.1 { format!("{:.1} ms", 1e3 * row.seconds) } else { format!("{:.2} s", row.seconds) };
-    let mut cells = vec![row.what.into(), row.width.to_string(), row.executor.into(), seconds];
+    let mut cells = vec![row.what.clone(), row.width.to_string(), row.executor.into(), seconds];
     if row.flops == 0 {
         cells.extend(["", "", "", ""].map(String::from));
     } else {
@@ -281,14 +324,23 @@ fn line(row: &Row) -> String {
     format!("| {} |", cells.join(" | "))
 }
 
-fn report(hardware: &str, ceiling: f64, rows: &[Row], kernels: &[KernelRow]) -> String {
+fn report(hardware: &str, ceiling: f64, rows: &[Row], scaling: &[Scaling], kernels: &[KernelRow]) -> String {
     let mut text = format!("{hardware}. `cargo xtask bench`\n\n");
     text +=
         &format!("Matrix library (`gemm`, 1536 × 1536 × 1536, all threads) in the same run: {:.0} GFLOP/s.\n\n", ceiling / 1e9);
     text += "| work, 64 × 64 pixels | width | executor | median time | GFLOP | GFLOP/s | of sgemm | plan of budget |\n";
     text += "|---|---|---|---|---|---|---|---|\n";
     rows.iter().for_each(|row| text += &format!("{}\n", line(row)));
-    text += "\nKernels of a pose step, each timed alone:\n\n| width | executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|---|\n";
+    if !scaling.is_empty() {
+        text += "\nCost against work, a pose step of Adam at width 64:\n\n";
+        text += "| executor | hypotheses | side | rays | median time | µs a ray |\n|---|---|---|---|---|---|\n";
+    }
+    for row in scaling {
+        let Scaling { executor, hypotheses, side, seconds } = row;
+        let (rays, each) = (row.rays(), 1e6 * seconds / f64::from(row.rays()));
+        text += &format!("| {executor} | {hypotheses} | {side} | {rays} | {:.1} ms | {each:.2} |\n", 1e3 * seconds);
+    }
+    text += "\nKernels of a pose step of Adam, each timed alone:\n\n| width | executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|---|\n";
     for of_one in kernels.chunk_by(|a, b| (a.width, a.executor) == (b.width, b.executor)) {
         for KernelRow { width, executor, label, steps, seconds, flops } in of_one.iter().take(8) {
             let rate = if *flops == 0 { String::new() } else { format!("{:.1}", *flops as f64 / seconds / 1e9) };
@@ -298,7 +350,15 @@ fn report(hardware: &str, ceiling: f64, rows: &[Row], kernels: &[KernelRow]) -> 
     text
 }
 
-fn as_json(hardware: &str, ceiling: f64, rows: &[Row], kernels: &[KernelRow]) -> serde_json::Value {
+fn as_json(hardware: &str, ceiling: f64, rows: &[Row], scaling: &[Scaling], kernels: &[KernelRow]) -> serde_json::Value {
+    let scaling: Vec<_> = scaling
+        .iter()
+        .map(|row| {
+            serde_json::json!({
+                "executor": row.executor, "hypotheses": row.hypotheses, "side": row.side, "rays": row.rays(), "seconds": row.seconds,
+            })
+        })
+        .collect();
     let rows: Vec<_> = rows
         .iter()
         .map(|row| {
@@ -317,5 +377,5 @@ fn as_json(hardware: &str, ceiling: f64, rows: &[Row], kernels: &[KernelRow]) ->
             })
         })
         .collect();
-    serde_json::json!({ "hardware": hardware, "sgemm_flops_per_second": ceiling, "rows": rows, "kernels": kernels })
+    serde_json::json!({ "hardware": hardware, "sgemm_flops_per_second": ceiling, "rows": rows, "scaling": scaling, "kernels": kernels })
 }
