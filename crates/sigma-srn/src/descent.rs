@@ -422,8 +422,8 @@ fn adam_stages(b: &mut Builder, parts: &Parts, loss: Loss, learning_rate: f64) -
     Ok((Some(targets), evaluate, descend, Moves::Adam { learning_rate, pose6, d_pose6, loss: loss_buffer, schedule, moments }))
 }
 
-/// Stages "evaluate" and "descend" of Levenberg–Marquardt. Rays are independent, so one backward pass for each channel, begun with ones, gives
-/// every ray's derivative of that channel: the rows of the Jacobian.
+/// Stages "evaluate" and "descend" of Levenberg–Marquardt. Rays are independent, so one backward pass for each channel, begun with
+/// the same number for every ray, gives every ray's derivative of that channel: the rows of the Jacobian.
 fn levenberg_marquardt_stages(b: &mut Builder, parts: &Parts, soft: f32) -> Result<Stages, PlanError> {
     let &Parts { network, saved, scratch, target, cut, most, shape: Shape { hypotheses, width, height, .. } } = parts;
     let n = hypotheses as usize;
