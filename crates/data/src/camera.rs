@@ -177,6 +177,25 @@ pub fn uniform_sphere(n: usize, radius: f64, seed: u64) -> Vec<DMat4> {
     (0..n).map(|_| camera()).collect()
 }
 
+/// The same cameras, displaced at random: each distance by up to the fraction `jitter`, and each aim off the origin by up to
+/// `jitter / 2`, which is that fraction of an object's radius. A renderer that has only seen one distance and one aim is wrong wherever
+/// a search passes by.
+pub fn jittered(cameras: &[DMat4], jitter: f64, seed: u64) -> Vec<DMat4> {
+    let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
+    let mut either_way = || rng.random_range(-1.0..=1.0f64);
+    let mut displaced = |camera: &DMat4| {
+        let distance = 1.0 + jitter * either_way();
+        let aim = loop {
+            let aim = DVec3::new(either_way(), either_way(), either_way());
+            if aim.length() <= 1.0 {
+                break 0.5 * jitter * aim;
+            }
+        };
+        DMat4::from_translation(aim) * look_at_origin(distance * camera.w_axis.truncate() - aim)
+    };
+    cameras.iter().map(&mut displaced).collect()
+}
+
 /// `n` cameras that look at the origin along the spherical spiral of the SRN test sets: from pole to pole in equal steps of the
 /// polar angle θ while the azimuth turns by `40·θ/π` radians. SRN walks only the upper half; here the whole sphere is walked,
 /// as the training cameras see it all. Steps are centred, so that no camera sits on a pole.
@@ -255,6 +274,22 @@ mod tests {
     fn the_seed_decides() {
         assert_eq!(uniform_sphere(20, 1.0, 3), uniform_sphere(20, 1.0, 3));
         assert_ne!(uniform_sphere(20, 1.0, 3), uniform_sphere(20, 1.0, 4));
+    }
+
+    #[test]
+    fn jitter_stays_within_its_bounds() {
+        let cameras = uniform_sphere(500, 1.3, 7);
+        assert_eq!(jittered(&cameras, 0.1, 1), jittered(&cameras, 0.1, 1));
+        let (mut nearest, mut furthest, mut most_off) = (f64::MAX, 0.0f64, 0.0f64);
+        for (was, is) in cameras.iter().zip(jittered(&cameras, 0.1, 1)) {
+            assert!(rigid_error(&is) < 1e-12);
+            let (was, is_at) = (was.w_axis.truncate(), is.w_axis.truncate());
+            assert!(was.angle_between(is_at) < 1e-7, "only the distance changes");
+            let off = is_at.length() * off_axis_deg(&is).to_radians().sin();
+            (nearest, furthest, most_off) = (nearest.min(is_at.length()), furthest.max(is_at.length()), most_off.max(off));
+        }
+        assert!((1.17..1.18).contains(&nearest) && (1.42..1.4301).contains(&furthest), "{nearest} to {furthest}");
+        assert!((0.045..0.0501).contains(&most_off), "{most_off}");
     }
 
     #[test]

@@ -54,6 +54,10 @@ struct Render {
     /// Where the cameras stand.
     #[arg(long, value_enum, default_value_t = Cameras::Sphere)]
     cameras: Cameras,
+    /// Displaces each camera at random: its distance by up to this fraction, its aim by up to this fraction of the object's
+    /// radius. Training views that are all at one distance, with one aim, make poses elsewhere less accurate.
+    #[arg(long, default_value_t = 0.0, value_parser = |x: &str| between(x, -f64::MIN_POSITIVE, 0.5))]
+    jitter: f64,
     /// Decides the random cameras, together with each instance's name.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -132,11 +136,13 @@ fn render(args: &Render) -> Result<()> {
         progress.set_message(name.clone());
         let model = upload(&rasterizer, mesh)?;
         let writer = InstanceWriter::create(args.out.join(name), &intrinsics, args.force)?;
+        // Each object is seen from other places.
+        let seed = args.seed ^ ldraw::name_hash(name);
         let poses = match args.cameras {
-            // Each object is seen from other places.
-            Cameras::Sphere => camera::uniform_sphere(views, args.radius, args.seed ^ ldraw::name_hash(name)),
+            Cameras::Sphere => camera::uniform_sphere(views, args.radius, seed),
             Cameras::Spiral => camera::spiral(views, args.radius),
         };
+        let poses = if args.jitter > 0.0 { camera::jittered(&poses, args.jitter, seed) } else { poses };
         for (i, pose) in poses.iter().enumerate() {
             let view = raster::View {
                 world_from_camera: pose.transpose().to_cols_array(),
