@@ -1,6 +1,6 @@
-// d_rgb = scale normaliser sign(e) (MAE, norm_l1) or scale normaliser 2e (MSE, norm_l2), e = rgb - target_rgb, sign(0) = 0.
+// d_rgb = scale normaliser w sign(e) (MAE, norm_l1) or scale normaliser w 2e (MSE, norm_l2), e = rgb - wanted, sign(0) = 0.
 // One invocation computes one value.
-// rgb, target_rgb [groups · rows_per_group, 3], count [images] (norm_l1 and norm_l2 only) → d_rgb [groups · rows_per_group, 3].
+// rgb [groups · rows_per_group, 3], wanted [groups · rows_per_group, 4] = (r, g, b, w), count [images] (norm_l1, norm_l2) → d_rgb as rgb.
 // OVERWRITES d_rgb.
 
 struct Params {
@@ -16,7 +16,7 @@ struct Params {
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> rgb: array<f32>;
-@group(0) @binding(2) var<storage, read> target_rgb: array<f32>;
+@group(0) @binding(2) var<storage, read> wanted: array<f32>;
 @group(0) @binding(3) var<storage, read> count: array<f32>;
 @group(0) @binding(4) var<storage, read_write> d_rgb: array<f32>;
 
@@ -38,7 +38,8 @@ fn main(
     if (i >= params.groups * values_per_group) {
         return;
     }
-    let e = rgb[i] - target_rgb[i];
+    let row = i / 3u;
+    let e = rgb[i] - wanted[i + row];
     let slope = select(sign(e), 2.0 * e, params.kind == MSE || params.kind == NORM_L2);
-    d_rgb[i] = params.scale * normaliser(params.first_group + i / values_per_group) * slope;
+    d_rgb[i] = params.scale * normaliser(params.first_group + i / values_per_group) * wanted[4u * row + 3u] * slope;
 }

@@ -1,6 +1,6 @@
-// partial[g, c] = number of target values that are not exactly 1 in the rows of chunk c.
+// partial[g, c] = Σ w over the wanted values that are not exactly 1 in the rows of chunk c.
 // One invocation counts one chunk of one image.
-// target_rgb [groups · rows_per_group, 3] → partial [groups, chunks].
+// wanted [groups · rows_per_group, 4] = (r, g, b, w) → partial [groups, chunks].
 // OVERWRITES partial.
 
 struct Params {
@@ -15,7 +15,7 @@ struct Params {
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> target_rgb: array<f32>;
+@group(0) @binding(1) var<storage, read> wanted: array<f32>;
 @group(0) @binding(2) var<storage, read_write> partial: array<f32>;
 
 @compute @workgroup_size(64)
@@ -28,12 +28,14 @@ fn main(
     if (index >= params.groups * params.chunks) {
         return;
     }
-    let image = 3u * (index / params.chunks) * params.rows_per_group;
+    let image = (index / params.chunks) * params.rows_per_group;
     let first = (index % params.chunks) * params.chunk_rows;
     let end = min(first + params.chunk_rows, params.rows_per_group);
     var total = 0.0;
-    for (var i = image + 3u * first; i < image + 3u * end; i++) {
-        total += select(0.0, 1.0, target_rgb[i] != 1.0);
+    for (var row = image + first; row < image + end; row++) {
+        for (var c = 0u; c < 3u; c++) {
+            total += select(0.0, wanted[4u * row + 3u], wanted[4u * row + c] != 1.0);
+        }
     }
     partial[index] = total;
 }

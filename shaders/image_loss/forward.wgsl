@@ -1,6 +1,6 @@
-// partial[g, c] = normaliser Σ |e| (MAE, norm_l1) or Σ e² (MSE, norm_l2) over the rows of chunk c, e = rgb - target_rgb.
+// partial[g, c] = normaliser Σ w |e| (MAE, norm_l1) or Σ w e² (MSE, norm_l2) over the rows of chunk c, e = rgb - wanted.
 // One invocation sums one chunk of one image.
-// rgb, target_rgb [groups · rows_per_group, 3], count [images] (norm_l1 and norm_l2 only) → partial [groups, chunks].
+// rgb [groups · rows_per_group, 3], wanted [groups · rows_per_group, 4] = (r, g, b, w), count [images] (norm_l1, norm_l2) → partial [groups, chunks].
 // OVERWRITES partial.
 
 struct Params {
@@ -16,7 +16,7 @@ struct Params {
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> rgb: array<f32>;
-@group(0) @binding(2) var<storage, read> target_rgb: array<f32>;
+@group(0) @binding(2) var<storage, read> wanted: array<f32>;
 @group(0) @binding(3) var<storage, read> count: array<f32>;
 @group(0) @binding(4) var<storage, read_write> partial: array<f32>;
 
@@ -38,14 +38,16 @@ fn main(
         return;
     }
     let group = index / params.chunks;
-    let image = 3u * group * params.rows_per_group;
+    let image = group * params.rows_per_group;
     let first = (index % params.chunks) * params.chunk_rows;
     let end = min(first + params.chunk_rows, params.rows_per_group);
     let squared = params.kind == MSE || params.kind == NORM_L2;
     var total = 0.0;
-    for (var i = image + 3u * first; i < image + 3u * end; i++) {
-        let e = rgb[i] - target_rgb[i];
-        total += select(abs(e), e * e, squared);
+    for (var row = image + first; row < image + end; row++) {
+        for (var c = 0u; c < 3u; c++) {
+            let e = rgb[3u * row + c] - wanted[4u * row + c];
+            total += wanted[4u * row + 3u] * select(abs(e), e * e, squared);
+        }
     }
     partial[index] = normaliser(params.first_group + group) * total;
 }

@@ -1,6 +1,6 @@
-// A = Σ w J Jᵀ, g = Σ w e J, loss = scale Σ ρ(e): e = rgb - target_rgb, ρ = √(e² + s²) - s, w = scale / √(e² + s²), J = ∂rgb/∂ξ of one channel.
+// A = Σ ω J Jᵀ, g = Σ ω e J, loss = scale Σ w ρ(e): e = rgb - wanted, ρ = √(e² + s²) - s, ω = scale w / √(e² + s²), J = ∂rgb/∂ξ of one channel.
 // One invocation sums one chunk of the rows of one image.
-// world_from_camera [images, 12], origin, direction, d_origin, d_direction, rgb, target_rgb [rows, 3] → partial [groups, chunks, 28].
+// world_from_camera [images, 12], origin, direction, d_origin, d_direction, rgb [rows, 3], wanted [rows, 4] = (r, g, b, w) → partial [groups, chunks, 28].
 // OVERWRITES partial.
 
 // The motion ξ = (ω, υ) turns the ray about the world's origin and shifts it, both in the camera's axes.
@@ -25,7 +25,7 @@ struct Params {
 @group(0) @binding(4) var<storage, read> d_origin: array<f32>;
 @group(0) @binding(5) var<storage, read> d_direction: array<f32>;
 @group(0) @binding(6) var<storage, read> rgb: array<f32>;
-@group(0) @binding(7) var<storage, read> target_rgb: array<f32>;
+@group(0) @binding(7) var<storage, read> wanted: array<f32>;
 @group(0) @binding(8) var<storage, read_write> partial: array<f32>;
 
 @compute @workgroup_size(64)
@@ -49,9 +49,11 @@ fn main(
     var sums: array<f32, 28>;
     for (var r = first; r < end; r++) {
         let at = 3u * (group * params.rows_per_group + r);
-        let e = rgb[at + params.channel] - target_rgb[at + params.channel];
+        let pixel = 4u * (group * params.rows_per_group + r);
+        let e = rgb[at + params.channel] - wanted[pixel + params.channel];
         let root = sqrt(e * e + params.soft * params.soft);
-        let weight = params.scale / root;
+        let counts = params.scale * wanted[pixel + 3u];
+        let weight = counts / root;
 
         let d_o = vec3(d_origin[at], d_origin[at + 1u], d_origin[at + 2u]) / params.seed;
         let d_d = vec3(d_direction[at], d_direction[at + 1u], d_direction[at + 2u]) / params.seed;
@@ -70,7 +72,7 @@ fn main(
             sums[21u + a] += weight * e * jacobian[a];
         }
         // The same as root - soft, without the cancellation.
-        sums[27] += params.scale * e * e / (root + params.soft);
+        sums[27] += counts * e * e / (root + params.soft);
     }
     for (var k = 0u; k < 28u; k++) {
         partial[28u * index + k] = sums[k];

@@ -151,17 +151,18 @@ table! {
     /// `d_z += 2 scale z`: ACCUMULATES onto the gradient that came through the hypernetwork. Extent: count.
     LATENT_LOSS_BACKWARD = "latent_loss"/"backward", TermParams, tile FLAT,
         (z: f32) -> (d_z: f32);
-    /// Number of target values that are not exactly 1: `target_rgb [groups · rows_per_group, 3]` → `partial [groups, chunks]`. Extent: groups · chunks.
+    /// Weights of the wanted values that are not exactly 1, added up: `wanted [groups · rows_per_group, 4]` (colour, weight) → `partial [groups, chunks]`.
+    /// Extent: groups · chunks.
     IMAGE_LOSS_COUNT = "image_loss"/"count", ImageLossParams, tile FLAT,
-        (target_rgb: f32) -> (partial: f32);
-    /// Sum of `|e|` or `e²` over the rows of a chunk, times the normaliser: `1 / values_per_image` (MAE, MSE) or
-    /// `1 / (1 + count[image])` (norm_l1, norm_l2), `image = first_group + group`. `rgb, target_rgb [groups · rows_per_group, 3]`
-    /// of the tile, `count [images]` of the whole batch (not read for MAE and MSE) → `partial [groups, chunks]`. Extent: groups · chunks.
+        (wanted: f32) -> (partial: f32);
+    /// Sum of `w |e|` or `w e²` over the rows of a chunk, times the normaliser: `1 / values_per_image` (MAE, MSE) or
+    /// `1 / (1 + count[image])` (norm_l1, norm_l2), `image = first_group + group`. `rgb [groups · rows_per_group, 3]`
+    /// and `wanted [groups · rows_per_group, 4]` of the tile, `count [images]` of the whole batch (not read for MAE and MSE) → `partial [groups, chunks]`. Extent: groups · chunks.
     IMAGE_LOSS_FORWARD = "image_loss"/"forward", ImageLossParams, tile FLAT,
-        (rgb: f32, target_rgb: f32, count: f32) -> (partial: f32);
-    /// `d_rgb = scale · normaliser · sign(e)` or `· 2e`; `sign(0) = 0`. Extent: values.
+        (rgb: f32, wanted: f32, count: f32) -> (partial: f32);
+    /// `d_rgb = scale · normaliser · w · sign(e)` or `· 2e`; `sign(0) = 0`. Extent: values.
     IMAGE_LOSS_BACKWARD = "image_loss"/"backward", ImageLossParams, tile FLAT,
-        (rgb: f32, target_rgb: f32, count: f32) -> (d_rgb: f32);
+        (rgb: f32, wanted: f32, count: f32) -> (d_rgb: f32);
     /// To `[0,1]` (not clamped), YIQ luma `0.299 R + 0.587 G + 0.114 B`, 2×2 average: `rgb [images, height, width, 3]` → `luma [images, h2, w2]`,
     /// `h2 = height / 2`, `w2 = width / 2` rounded down. Extent: images · h2 · w2, as for the next ones.
     GMSD_POOL = "gmsd"/"pool", GmsdParams, tile FLAT,
@@ -191,10 +192,10 @@ table! {
     SUM_FORWARD = "sum"/"forward", SumParams, tile FLAT,
         (x: f32) -> (y: f32);
     /// Normal equations of one channel's residuals over a motion `ξ` about the object, in the camera's axes: per chunk of an image's
-    /// rows the upper triangle of `A = Σ w J Jᵀ` (21 values), `g = Σ w e J` (6) and the loss `scale Σ ρ(e)` (1), `ρ = √(e² + s²) - s`.
-    /// `origin, direction, d_origin, d_direction, rgb, target_rgb [rows,3]` → `partial [groups, chunks, 28]`.
+    /// rows the upper triangle of `A = Σ ω J Jᵀ` (21 values), `g = Σ ω e J` (6) and the loss `scale Σ w ρ(e)` (1), `ρ = √(e² + s²) - s`, `ω = scale w / √(e² + s²)`.
+    /// `origin, direction, d_origin, d_direction, rgb [rows,3]`, `wanted [rows,4]` (colour, weight `w`) → `partial [groups, chunks, 28]`.
     LEVENBERG_MARQUARDT_EQUATIONS = "levenberg_marquardt"/"equations", EquationsParams, tile FLAT,
-        (world_from_camera: f32, origin: f32, direction: f32, d_origin: f32, d_direction: f32, rgb: f32, target_rgb: f32) -> (partial: f32);
+        (world_from_camera: f32, origin: f32, direction: f32, d_origin: f32, d_direction: f32, rgb: f32, wanted: f32) -> (partial: f32);
     /// Where the trial's loss is lower, keeps its equations and pose, and damps less; elsewhere damps more. Extent: poses.
     LEVENBERG_MARQUARDT_ACCEPT = "levenberg_marquardt"/"accept", PoseParams, tile FLAT,
         (equations: f32, world_from_camera: f32) -> (best_equations: f32, best_pose: f32, damping: f32);

@@ -201,7 +201,7 @@ impl Bench<'_> {
         let shape = Shape { hypotheses, width: side, height: side, instances: 1 };
         let mut descent = Descent::new(self.engine, self.model, shape, method)?;
         let target = target(3 * hypotheses * pixels);
-        descent.set_targets(&[0], &vec![0; hypotheses as usize], &rays(hypotheses, side, pixels), &target)?;
+        descent.set_targets(&[0], &vec![0; hypotheses as usize], &rays(hypotheses, side, pixels), &target, None)?;
         let poses = camera::fixed24(1.3).iter().cycle().take(hypotheses as usize).map(Pose6::from_matrix).collect::<Vec<_>>();
         descent.set_poses(&poses)?;
         let time = self.measure(|| {

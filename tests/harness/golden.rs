@@ -275,7 +275,7 @@ fn descent(engine: &Engine, report: &Report, loss: Loss, learning_rate: f64, sta
     let batch = golden.batch()?;
     let ready = || {
         let mut descent = Descent::new(engine, &golden.model, shape, Method::Adam { loss, learning_rate })?;
-        descent.set_targets(&golden.index, &slots, &batch.rays, &batch.target_rgb)?;
+        descent.set_targets(&golden.index, &slots, &batch.rays, &batch.target_rgb, None)?;
         Ok(descent)
     };
     let mut descent = ready().map_err(|error| report.error(error))?;

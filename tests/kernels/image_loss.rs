@@ -7,10 +7,14 @@ use crate::{KernelTest, ROWS};
 
 pub static COUNT: KernelTest = KernelTest {
     kernel: &IMAGE_LOSS_COUNT,
-    // Whole numbers.
+    // Sums of quarters.
     tolerance: 0.0,
     cases: whole_images,
-    faults: &[("count", "!= 1.0", "== 1.0"), ("count", "% params.chunks)", "/ params.chunks)")],
+    faults: &[
+        ("count", "!= 1.0", "== 1.0"),
+        ("count", "% params.chunks)", "/ params.chunks)"),
+        ("count", "4u * row + 3u", "4u * row"),
+    ],
 };
 
 pub static FORWARD: KernelTest = KernelTest {
@@ -22,7 +26,8 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward", "1.0 + count[image]", "count[image]"),
         ("forward", "params.kind == MSE", "params.kind == MAE"),
         ("forward", "|| params.kind == NORM_L2) {", "|| params.kind == MAE) {"),
-        ("forward", "3u * group * params.rows_per_group", "group * params.rows_per_group"),
+        ("forward", "group * params.rows_per_group;", "params.rows_per_group;"),
+        ("forward", "wanted[4u * row + 3u] *", ""),
         ("forward", "first + params.chunk_rows", "params.chunk_rows"),
     ],
 };
@@ -36,6 +41,8 @@ pub static BACKWARD: KernelTest = KernelTest {
         ("backward", "params.first_group + i", "0u + i"),
         ("backward", "sign(e)", "select(-1.0, 1.0, e >= 0.0)"),
         ("backward", "2.0 * e", "e"),
+        ("backward", "wanted[4u * row + 3u] *", ""),
+        ("backward", "wanted[i + row]", "wanted[i]"),
         ("backward", "f32(params.values_per_image)", "f32(params.rows_per_group)"),
     ],
 };
@@ -57,12 +64,15 @@ fn backward_matches_reference() {
 
 const KINDS: [Kind; 4] = [Kind::Mae, Kind::Mse, Kind::NormL1, Kind::NormL2];
 
-/// Render and target: every fifth value of the target is white, every seventh is met exactly.
-fn pictures(s: &mut Sketch, len: usize) -> [Vec<f32>; 2] {
-    let [mut rgb, mut target] = [(); 2].map(|()| s.numbers(len));
+/// Render `[rows,3]`, and what is wanted `[rows,4]`: every fifth value is white, every seventh is met exactly; some rows count less,
+/// some not at all.
+fn pictures(s: &mut Sketch, rows: usize) -> [Vec<f32>; 2] {
+    let [mut rgb, mut target] = [(); 2].map(|()| s.numbers(3 * rows));
     target.iter_mut().step_by(5).for_each(|target| *target = 1.0);
     rgb.iter_mut().zip(&target).skip(1).step_by(7).for_each(|(rgb, target)| *rgb = *target);
-    [rgb, target]
+    let weights = [1.0, 0.25, 0.0, 1.0, 1.75].iter().cycle();
+    let wanted = target.chunks(3).zip(weights).flat_map(|(rgb, &weight)| [rgb[0], rgb[1], rgb[2], weight]).collect();
+    [rgb, wanted]
 }
 
 fn whole_images() -> Vec<Case> {
@@ -72,13 +82,13 @@ fn whole_images() -> Vec<Case> {
 
 fn whole_images_case(kind: Kind, images: u32, pixels: u32) -> Case {
     let mut s = Sketch::new(format!("{kind:?}, {images} images of {pixels} pixels"));
-    let [rgb, target] = pictures(&mut s, 3 * (images * pixels) as usize);
+    let [rgb, wanted] = pictures(&mut s, (images * pixels) as usize);
     let rgb = s.input("rgb", rgb);
-    let target = s.input("target_rgb", target);
+    let wanted = s.input("wanted", wanted);
     let partial = s.scratch("partial", image_loss::partial_len(images, pixels));
     let [count, loss] = ["count", "loss"].map(|name| s.scratch(name, images as usize));
-    s.step(|b| image_loss::count(b, images, pixels, target, partial, count));
-    s.step(|b| image_loss::forward(b, kind, images, pixels, rgb, target, count, partial, loss));
+    s.step(|b| image_loss::count(b, images, pixels, wanted, partial, count));
+    s.step(|b| image_loss::forward(b, kind, images, pixels, rgb, wanted, count, partial, loss));
     s.finish()
 }
 
@@ -90,11 +100,11 @@ fn tiles() -> Vec<Case> {
 fn tile_case(kind: Kind, rows: Rows) -> Case {
     let mut s = Sketch::new(format!("{kind:?}, {rows:?}"));
     let n = 3 * rows.count() as usize;
-    let [rgb, target] = pictures(&mut s, n);
+    let [rgb, wanted] = pictures(&mut s, rows.count() as usize);
     let rgb = s.input("rgb", rgb);
-    let target = s.input("target_rgb", target);
+    let wanted = s.input("wanted", wanted);
     let count = s.input("count", (0..rows.first_group + rows.groups).map(|image| 10.0 + image as f32).collect());
     let d_rgb = s.scratch("d_rgb", n);
-    s.step(|b| image_loss::backward(b, kind, rows, 2 * rows.rows_per_group, 0.3, rgb, target, count, d_rgb));
+    s.step(|b| image_loss::backward(b, kind, rows, 2 * rows.rows_per_group, 0.3, rgb, wanted, count, d_rgb));
     s.finish()
 }

@@ -12,7 +12,9 @@ pub static EQUATIONS: KernelTest = KernelTest {
     faults: &[
         ("equations", "12u * (params.first_group + group)", "12u * group"),
         ("equations", "rgb[at + params.channel]", "rgb[at]"),
-        ("equations", "params.scale / root", "params.scale"),
+        ("equations", "counts / root", "counts"),
+        ("equations", "* wanted[pixel + 3u]", ""),
+        ("equations", "wanted[pixel + params.channel]", "wanted[pixel]"),
         ("equations", "/ params.seed;", ";"),
         ("equations", "dot(column2, turn)", "dot(column1, turn)"),
         ("equations", "cross(vec3(origin", "-cross(vec3(origin"),
@@ -81,6 +83,9 @@ fn equations_case(rows: Rows) -> Case {
     let mut s = Sketch::new(format!("{rows:?}"));
     let n = 3 * rows.count() as usize;
     let images = (rows.first_group + rows.groups) as usize;
+    // Weights from 0.
+    let mut wanted = s.numbers(4 * rows.count() as usize);
+    wanted.iter_mut().skip(3).step_by(4).for_each(|weight| *weight = weight.max(0.0));
     let residuals = Residuals {
         world_from_camera: s.random("world_from_camera", 12 * images),
         origin: s.random("origin", n),
@@ -88,7 +93,7 @@ fn equations_case(rows: Rows) -> Case {
         d_origin: s.random("d_origin", n),
         d_direction: s.random("d_direction", n),
         rgb: s.random("rgb", n),
-        target_rgb: s.random("target_rgb", n),
+        wanted: s.input("wanted", wanted),
     };
     let channel = Channel { number: 2, seed: 0.25, scale: 0.3, soft: 0.2 };
     let partial = s.scratch("partial", levenberg_marquardt::partial_len(rows));

@@ -1,9 +1,10 @@
 //! What the model is for: it learns, it repeats itself, it finds poses.
 
 use sigma_srn::{
-    Descent, Engine, Intrinsics, Method, Model, ModelConfig, Pose6, Rays, Renderer, Shape, Train, Trainer, TrainingBatch,
+    Descent, Engine, Intrinsics, Loss, Method, Model, ModelConfig, Options, Phase, Pose6, Query, Rays, Renderer, Shape, Train,
+    Trainer, TrainingBatch,
 };
-use sigma_srn::{camera, pixel_grid, stream};
+use sigma_srn::{camera, estimate, pixel_grid, stream};
 use srn_tests::gpu;
 
 const SIDE: u32 = 12;
@@ -103,7 +104,7 @@ fn a_pose_near_the_truth_comes_nearer() {
         let mut rays = Rays::default();
         let mut random = stream(0, 0);
         truths.iter().for_each(|truth| rays.push(truth, &intrinsics(), pixel_grid(SIDE, SIDE, 1), &mut random));
-        descent.set_targets(&[0, 1], &[0, 1, 1], &rays, &rendering.rgb).unwrap();
+        descent.set_targets(&[0, 1], &[0, 1, 1], &rays, &rendering.rgb, None).unwrap();
         let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2);
         let starts: Vec<Pose6> = truths.iter().map(|truth| Pose6::from_matrix(&(turn * *truth))).collect();
         descent.set_poses(&starts).unwrap();
@@ -118,4 +119,51 @@ fn a_pose_near_the_truth_comes_nearer() {
             assert!(after < 0.5 * before, "{engine}: {before}° to {after}°");
         }
     }
+}
+
+/// Something black stands before a corner of the picture: where it does not count, the search ends as if it were not there, to the
+/// last digit, and so do its losses.
+#[test]
+fn what_does_not_count_has_no_influence() {
+    let mut trainer = trainer(&Engine::cpu());
+    train(&mut trainer, 20);
+    let model = trainer.model().unwrap();
+    let truth = camera::fixed24(1.3)[1];
+    let free = picture(1, &truth);
+    let hidden = |pixel: usize| pixel % SIDE as usize > 6 && pixel / SIDE as usize > 3;
+    let mut occluded = free.clone();
+    (0..RAYS as usize).filter(|&pixel| hidden(pixel)).for_each(|pixel| occluded[3 * pixel..][..3].fill(-1.0));
+    let mask: Vec<f32> = (0..RAYS as usize).map(|pixel| if hidden(pixel) { 0.0 } else { 1.0 }).collect();
+    let query = |rgb: &[f32], weights: Option<&[f32]>| Query {
+        instance: 1,
+        rgb: rgb.to_vec(),
+        weights: weights.map(<[f32]>::to_vec),
+        width: SIDE,
+        height: SIDE,
+        intrinsics: intrinsics(),
+        starts: camera::neighbor4(&truth),
+    };
+    let adam = |loss| Method::Adam { loss, learning_rate: 0.01 };
+    let methods = [Loss::Mae, Loss::NormL2].map(adam).into_iter().chain([Method::LevenbergMarquardt { soft: 0.3 }]);
+    for method in methods {
+        let phases = [(2, 4), (1, 2)].map(|(stride, keep)| Phase { steps: 3, stride, keep }).into();
+        let options = Options { method, phases, seed: 0 };
+        for engine in engines() {
+            let found = |rgb: &[f32], weights| {
+                let queries = [query(rgb, weights), query(&free, None)];
+                let found = estimate(&engine, model, &queries, &options, |_| Ok(())).unwrap();
+                found[0].ranking.iter().flat_map(|r| [&r.pose.0[..], &[r.loss]].concat()).collect::<Vec<f64>>()
+            };
+            assert_eq!(found(&occluded, Some(&mask)), found(&free, Some(&mask)), "{engine}, {method:?}");
+            assert_ne!(found(&occluded, None), found(&free, None), "{engine}, {method:?}: the corner shows nothing");
+        }
+    }
+    let refused = |weights: Vec<f32>, method| {
+        let options = Options { method, ..Options::default() }.with_stride(1);
+        estimate(&Engine::cpu(), model, &[query(&free, Some(&weights))], &options, |_| Ok(())).unwrap_err().to_string()
+    };
+    assert!(refused(mask[1..].to_vec(), adam(Loss::Mae)).contains("144 weights"));
+    assert!(refused(vec![f32::NAN; RAYS as usize], adam(Loss::Mae)).contains("finite"));
+    assert!(refused(vec![0.0; RAYS as usize], adam(Loss::Mae)).contains("none of them"));
+    assert!(refused(mask, adam(Loss::Gmsd)).contains("GMSD"));
 }

@@ -110,9 +110,9 @@ fn many_starts_in_one_plan_give_what_each_gives_alone() {
             rays.uv = part(&rays.uv, 2 * RAYS as usize);
             rays.z0 = part(&rays.z0, RAYS as usize);
             let instances = [1, 2, 3];
-            alone
-                .set_targets(&instances, &[batch.instances[start] - 1], &rays, &part(&batch.target_rgb, 3 * RAYS as usize))
-                .unwrap();
+            let target = part(&batch.target_rgb, 3 * RAYS as usize);
+            let weights = weights(method, STARTS).map(|weights| part(&weights, RAYS as usize));
+            alone.set_targets(&instances, &[batch.instances[start] - 1], &rays, &target, weights.as_deref()).unwrap();
             alone.set_poses(&poses(STARTS)[start..=start]).unwrap();
             all.push(refined(&mut alone));
         }

@@ -10,6 +10,7 @@ use glam::DMat4;
 use image::{Rgb, RgbImage};
 use indicatif::{ProgressBar, ProgressStyle};
 use sigma_srn::{Engine, Gpu, Intrinsics};
+use srn_data::camera::Axes;
 use srn_data::{Dataset, LoadedView, SrnSet, sheet};
 use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::prelude::*;
@@ -102,6 +103,17 @@ fn memory(text: &str) -> std::result::Result<u64, String> {
         Ok(number) if number * unit >= 1.0 => Ok((number * unit) as u64),
         _ => Err("expected a positive number of bytes".into()),
     }
+}
+
+/// The axes of a camera by their name.
+pub(crate) fn axes(text: &str) -> std::result::Result<Axes, String> {
+    named(text, &Axes::ALL, Axes::name)
+}
+
+/// One of `all` by its name.
+pub(crate) fn named<T: Copy>(text: &str, all: &[T], name: fn(T) -> &'static str) -> std::result::Result<T, String> {
+    let names = || all.iter().map(|&one| name(one)).collect::<Vec<_>>().join(", ");
+    all.iter().copied().find(|&one| name(one) == text).ok_or_else(|| format!("expected one of {}", names()))
 }
 
 /// The exit code of a binary: 0 done, 1 did not converge or was stopped, 2 an error, which is printed in one line.

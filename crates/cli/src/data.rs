@@ -9,8 +9,9 @@ use srn_data::camera::Axes;
 use srn_data::capture::{Bounds, Capture, FrameRecord, UpAxis};
 use srn_data::formats::{self, Format, ReadOptions, WriteOptions, Written, bop};
 use srn_data::inspect::{self, Origin};
+use srn_data::target::MARGIN;
 
-use crate::common::{Result, progress};
+use crate::common::{Result, axes, named, progress};
 
 /// Flags that say what a source is, and how it differs from what its format promises.
 #[derive(Args, Debug)]
@@ -51,15 +52,6 @@ fn source_format(text: &str) -> std::result::Result<SourceFormat, String> {
 
 fn target_format(text: &str) -> std::result::Result<Format, String> {
     named(text, &Format::ALL, Format::name)
-}
-
-fn axes(text: &str) -> std::result::Result<Axes, String> {
-    named(text, &Axes::ALL, Axes::name)
-}
-
-fn named<T: Copy>(text: &str, all: &[T], name: fn(T) -> &'static str) -> std::result::Result<T, String> {
-    let names = || all.iter().map(|&one| name(one)).collect::<Vec<_>>().join(", ");
-    all.iter().copied().find(|&one| name(one) == text).ok_or_else(|| format!("expected one of {}", names()))
 }
 
 fn above_zero(text: &str) -> std::result::Result<f64, String> {
@@ -124,7 +116,7 @@ pub struct Import {
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
     side: Option<u32>,
     /// Room around the object in a square, on each side, as a share of its extent.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.1, value_parser = share)]
+    #[arg(long, value_name = "SHARE", default_value_t = MARGIN, value_parser = share)]
     margin: f64,
     /// Centre of the object in the source's units. Default: BOP's box, or where the silhouettes' middles meet.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, value_parser = point)]
@@ -295,6 +287,8 @@ fn target(text: &str) -> std::result::Result<Target, String> {
 /// What is needed of the output of `sigma-pose estimate --json`.
 #[derive(Deserialize)]
 struct Estimates {
+    /// The axes of the poses.
+    convention: Axes,
     images: Vec<Estimate>,
 }
 
@@ -375,7 +369,11 @@ fn read_estimates(path: &Path) -> Result<Vec<Estimate>> {
     let about = |error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
     let text = std::fs::read_to_string(path).map_err(|error| about(&error))?;
     let estimates: Estimates = serde_json::from_str(&text).map_err(|error| about(&error))?;
-    Ok(estimates.images)
+    let ours = |found: Estimate| {
+        let pose = DMat4::from_cols_array_2d(&found.world_from_camera).transpose();
+        Estimate { world_from_camera: estimates.convention.to_ours(pose).transpose().to_cols_array_2d(), ..found }
+    };
+    Ok(estimates.images.into_iter().map(ours).collect())
 }
 
 /// Flags of `sigma-data inspect`.

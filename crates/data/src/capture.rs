@@ -62,11 +62,7 @@ impl Capture {
     pub fn transform(&mut self, similarity: &DMat4) {
         let scale = similarity.x_axis.truncate().length();
         for frame in &mut self.frames {
-            let mut pose = *similarity * frame.camera.world_from_camera;
-            for axis in [&mut pose.x_axis, &mut pose.y_axis, &mut pose.z_axis] {
-                *axis /= scale;
-            }
-            frame.camera.world_from_camera = pose;
+            frame.camera.world_from_camera = moved(similarity, &frame.camera.world_from_camera);
         }
         // What is carried and not applied holds no longer.
         self.applied_transform = None;
@@ -159,6 +155,16 @@ impl Capture {
     }
 }
 
+/// The pose of a camera after the world was moved and scaled: `similarity` is `new_world_from_old_world`.
+pub fn moved(similarity: &DMat4, world_from_camera: &DMat4) -> DMat4 {
+    let scale = similarity.x_axis.truncate().length();
+    let mut pose = *similarity * *world_from_camera;
+    for axis in [&mut pose.x_axis, &mut pose.y_axis, &mut pose.z_axis] {
+        *axis /= scale;
+    }
+    pose
+}
+
 /// The point with the least sum of squared distances to lines, each a point and a direction; none if all are parallel.
 pub(crate) fn nearest_point(lines: &[(DVec3, DVec3)]) -> Option<DVec3> {
     let (mut a, mut b) = (DMat3::ZERO, DVec3::ZERO);
@@ -197,15 +203,14 @@ impl FrameRecord {
     /// Reads the record of an instance's folder; `None` if there is none.
     pub fn read(dir: &Path) -> Result<Option<Self>> {
         let path = dir.join(Self::FILE);
-        if !path.exists() {
-            return Ok(None);
-        }
-        let record: Self = crate::formats::from_json(&path, &crate::error::read_text(&path)?)?;
-        let m = record.matrix();
-        let scale = m.x_axis.truncate().length();
-        let rigid = DMat4::from_cols(m.x_axis / scale, m.y_axis / scale, m.z_axis / scale, m.w_axis);
-        crate::srn::rigid(&path, "world_from_source", rigid)?;
-        Ok(Some(record))
+        if path.exists() { Self::open(&path).map(Some) } else { Ok(None) }
+    }
+
+    /// Reads a record.
+    pub fn open(path: &Path) -> Result<Self> {
+        let record: Self = crate::formats::from_json(path, &crate::error::read_text(path)?)?;
+        crate::srn::rigid(path, "world_from_source", moved(&record.matrix(), &DMat4::IDENTITY))?;
+        Ok(record)
     }
 
     /// Writes the record into an instance's folder.

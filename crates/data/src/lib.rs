@@ -20,6 +20,7 @@ pub mod ply;
 pub mod sheet;
 pub mod srn;
 pub mod stl;
+pub mod target;
 
 pub use camera::Camera;
 pub use capture::Capture;

@@ -18,21 +18,11 @@ const OPAQUE: u8 = 127;
 impl Picture {
     /// Reads a picture; its transparency and the mask say what is background.
     pub fn open(path: &Path, mask: Option<&Path>) -> Result<Self> {
-        let decode = |path: &Path| -> Result<image::DynamicImage> {
-            image::ImageReader::open(path).at(path)?.with_guessed_format().at(path)?.decode().at(path)
-        };
         let mut picture = decode(path)?.into_rgba8();
         if let Some(path) = mask {
-            // A mask is white where the object is; one that is transparent, as background removers write it, is opaque there.
-            let mask = decode(path)?.into_luma_alpha8();
-            let channel = usize::from(mask.pixels().any(|mask| mask[1] < 255));
-            let (width, height) = picture.dimensions();
-            if mask.dimensions() != (width, height) {
-                let expected = format!("{width}×{height}, as its picture");
-                return Err(Error::field(path, "size", expected, format!("{}×{}", mask.width(), mask.height())));
-            }
-            for (pixel, mask) in picture.pixels_mut().zip(mask.pixels()) {
-                pixel[3] = ((u32::from(pixel[3]) * u32::from(mask[channel]) + 127) / 255) as u8;
+            let mask = read_mask(path, [picture.width(), picture.height()])?;
+            for (pixel, mask) in picture.pixels_mut().zip(mask) {
+                pixel[3] = ((u32::from(pixel[3]) * u32::from(mask) + 127) / 255) as u8;
             }
         }
         Ok(Self(picture))
@@ -119,6 +109,22 @@ impl Picture {
         }
         Some(sum)
     }
+}
+
+fn decode(path: &Path) -> Result<image::DynamicImage> {
+    image::ImageReader::open(path).at(path)?.with_guessed_format().at(path)?.decode().at(path)
+}
+
+/// Reads the mask of a picture of this size, row by row: 255 where the object is. A mask is white there; one that is transparent,
+/// as background removers write it, is opaque there.
+pub(crate) fn read_mask(path: &Path, [width, height]: [u32; 2]) -> Result<Vec<u8>> {
+    let mask = decode(path)?.into_luma_alpha8();
+    if mask.dimensions() != (width, height) {
+        let expected = format!("{width}×{height}, as its picture");
+        return Err(Error::field(path, "size", expected, format!("{}×{}", mask.width(), mask.height())));
+    }
+    let channel = usize::from(mask.pixels().any(|mask| mask[1] < 255));
+    Ok(mask.pixels().map(|mask| mask[channel]).collect())
 }
 
 /// The corners of the box around points; `None` without points.

@@ -18,17 +18,36 @@ pub struct Pixels {
 impl Pixels {
     /// Reads an image file of any colour type and depth; transparency is laid over white.
     pub fn open(path: &Path) -> Result<Self> {
+        Ok(Self::open_with_opacity(path)?.0)
+    }
+
+    /// The same, with the opacity of each pixel, 0 to 1.
+    pub(crate) fn open_with_opacity(path: &Path) -> Result<(Self, Vec<f32>)> {
         let rgba = image::ImageReader::open(path).at(path)?.with_guessed_format().at(path)?.decode().at(path)?.into_rgba32f();
         let data = rgba.pixels().flat_map(|p| [0, 1, 2].map(|c| 2.0 * (p[c] * p[3] + (1.0 - p[3])) - 1.0)).collect();
-        Ok(Self { width: rgba.width() as usize, height: rgba.height() as usize, data })
+        let opacity = rgba.pixels().map(|p| p[3]).collect();
+        Ok((Self { width: rgba.width() as usize, height: rgba.height() as usize, data }, opacity))
     }
 
     /// The centred square.
     pub fn centre_square(&self) -> Self {
         let side = self.width.min(self.height);
-        let [x0, y0] = [(self.width - side) / 2, (self.height - side) / 2];
-        let row = |y: usize| &self.data[3 * (y * self.width + x0)..][..3 * side];
-        Self { width: side, height: side, data: (y0..y0 + side).flat_map(row).copied().collect() }
+        let corner = [(self.width - side) / 2, (self.height - side) / 2];
+        self.square(corner.map(|x| x as i64), side, 1.0)
+    }
+
+    /// The square of `side` pixels from `corner` on, `outside` where it reaches out of the image.
+    pub(crate) fn square(&self, corner: [i64; 2], side: usize, outside: f32) -> Self {
+        let mut data = vec![outside; 3 * side * side];
+        for (y, row) in (corner[1]..).zip(data.chunks_exact_mut(3 * side)) {
+            let there = usize::try_from(y).ok().filter(|&y| y < self.height);
+            for (x, pixel) in (corner[0]..).zip(row.chunks_exact_mut(3)) {
+                if let (Some(y), Some(x)) = (there, usize::try_from(x).ok().filter(|&x| x < self.width)) {
+                    pixel.copy_from_slice(&self.data[3 * (y * self.width + x)..][..3]);
+                }
+            }
+        }
+        Self { width: side, height: side, data }
     }
 
     /// A `width × height` image in which each pixel is the mean of the area that it covers here.

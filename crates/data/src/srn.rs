@@ -190,12 +190,7 @@ pub fn picture_size(path: &Path) -> Result<[usize; 2]> {
 /// other sizes is the convention's, not corrected here).
 pub fn load_square(path: &Path, intrinsics: &Intrinsics, side: usize) -> Result<(Pixels, [f32; 4])> {
     let image = Pixels::open(path)?;
-    let [width, height] = intrinsics.size;
-    if image.width * height != image.height * width {
-        let found = format!("{}×{}", image.width, image.height);
-        return Err(Error::field(path, "size", format!("the aspect of intrinsics.txt, {width}×{height}"), found));
-    }
-    let in_file = intrinsics.of_size([image.width, image.height]);
+    let in_file = intrinsics.of_picture(path, [image.width, image.height])?;
     let Intrinsics { focal: [fx, fy], centre: [cx, cy], .. } = in_file.of_square(side);
     Ok((image.centre_square().area_resample(side, side), [fx, fy, cx, cy].map(|x| x as f32)))
 }
@@ -296,6 +291,20 @@ impl Intrinsics {
             return Err(Error::field(path, "cx cy", expected, format!("{cx}, {cy}")));
         }
         Ok((intrinsics, inverted))
+    }
+
+    /// The same for this picture of that size, which must have the shape that they belong to.
+    pub(crate) fn of_picture(&self, path: &Path, [width, height]: [usize; 2]) -> Result<Self> {
+        let [w, h] = self.size;
+        if width * h != height * w {
+            return Err(Error::field(
+                path,
+                "size",
+                format!("the aspect of intrinsics.txt, {w}×{h}"),
+                format!("{width}×{height}"),
+            ));
+        }
+        Ok(self.of_size([width, height]))
     }
 
     /// The same for the whole picture at another size.

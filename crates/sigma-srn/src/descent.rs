@@ -9,6 +9,7 @@ use crate::camera::{Pose6, from_rows, to_rows};
 use crate::engine::{Engine, Runner};
 use crate::model::Model;
 use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, Started, Trainable, backward, forward};
+use crate::rays::wanted;
 use crate::{Error, Rays};
 
 /// How a render is compared with its target (spec 4).
@@ -79,7 +80,9 @@ pub struct Shape {
 
 struct Handles {
     network: Network,
+    /// See [`wanted`] `[hypotheses, rays, 4]`; for GMSD, which knows no weights, colours `[hypotheses, rays, 3]`.
     target: BufferId,
+    gmsd: bool,
     instances: StageId,
     /// What follows from the targets alone, with the losses that have such a thing.
     targets: Option<StageId>,
@@ -167,9 +170,17 @@ impl Descent {
         }
     }
 
-    /// Sets what is looked for: hypothesis `k` shows instance `instances[slot[k]]`; `rays` (without poses) and
-    /// `target_rgb [hypotheses, rays, 3]` in [-1, 1].
-    pub fn set_targets(&mut self, instances: &[u32], slots: &[u32], rays: &Rays, target_rgb: &[f32]) -> Result<(), Error> {
+    /// Sets what is looked for: hypothesis `k` shows instance `instances[slot[k]]`; `rays` (without poses), `target_rgb
+    /// [hypotheses, rays, 3]` in [-1, 1], and how much each ray counts, `weights [hypotheses, rays]`: 1 where none are given. A ray
+    /// of weight 0 has no part in losses and steps. Losses are means where the weights' mean is 1.
+    pub fn set_targets(
+        &mut self,
+        instances: &[u32],
+        slots: &[u32],
+        rays: &Rays,
+        target_rgb: &[f32],
+        weights: Option<&[f32]>,
+    ) -> Result<(), Error> {
         let network = &self.handles.network;
         if let Some(instance) = instances.iter().find(|&&instance| instance >= network.instances) {
             let what = format!("number {instance}, but the model has {}", network.instances);
@@ -182,10 +193,25 @@ impl Descent {
         if let Some(value) = target_rgb.iter().find(|value| !value.is_finite()) {
             return Err(Error::Input { input: "target image".into(), what: format!("has the value {value}") });
         }
+        let Shape { hypotheses, width, height, .. } = self.shape;
+        let n = hypotheses as usize * width as usize * height as usize;
+        if let Some(weights) = weights {
+            let what = match weights.iter().find(|weight| !(0.0..f32::INFINITY).contains(*weight)) {
+                Some(weight) => Some(format!("has the value {weight}")),
+                None if self.handles.gmsd => Some("GMSD compares whole images: it takes none".into()),
+                None => (weights.len() != n).then(|| format!("{} for {n} rays", weights.len())),
+            };
+            if let Some(what) = what {
+                return Err(Error::Input { input: "weights".into(), what });
+            }
+        }
         self.runner.write_u32(network.index, instances)?;
         self.runner.write_u32(network.slots, slots)?;
         rays.write(&mut *self.runner, network)?;
-        self.runner.write(self.handles.target, target_rgb)?;
+        match self.handles.gmsd {
+            true => self.runner.write(self.handles.target, target_rgb)?,
+            false => self.runner.write(self.handles.target, &wanted(target_rgb, weights))?,
+        }
         self.runner.run(self.handles.instances)?;
         if let Some(targets) = self.handles.targets {
             self.runner.run(targets)?;
@@ -315,7 +341,8 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, method: Method, tile_rows
     let saved = Saved::new(b, &network, Purpose::Pose, most)?;
     let scratch = Scratch::new(b, &network, &saved)?;
     let hyper_saved = HyperSaved::new(b, &network)?;
-    let target = b.input("target rgb", 3 * hypotheses as usize * rays_per_image as usize)?;
+    let gmsd = matches!(method, Method::Adam { loss: Loss::Gmsd, .. });
+    let target = b.input("target", if gmsd { 3 } else { 4 } * hypotheses as usize * rays_per_image as usize)?;
 
     let instances = b.stage("instances");
     forward::hypernetwork(b, &network, &hyper_saved)?;
@@ -325,7 +352,7 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, method: Method, tile_rows
         Method::Adam { loss, learning_rate } => adam_stages(b, &parts, loss, learning_rate)?,
         Method::LevenbergMarquardt { soft } => levenberg_marquardt_stages(b, &parts, soft)?,
     };
-    Ok(Handles { network, target, instances, targets, evaluate, descend, moves })
+    Ok(Handles { network, target, gmsd, instances, targets, evaluate, descend, moves })
 }
 
 /// What both methods work with.
@@ -362,7 +389,7 @@ fn adam_stages(b: &mut Builder, parts: &Parts, loss: Loss, learning_rate: f64) -
         Some(kind) => {
             let count = b.scratch("target count", n)?;
             image_loss::count(b, hypotheses, rays_per_image, target, partial, count)?;
-            Comparison::PerPixel { kind, count, tile_target: b.scratch("tile target", 3 * most as usize)? }
+            Comparison::PerPixel { kind, count, tile_target: b.scratch("tile target", 4 * most as usize)? }
         }
         None => {
             let pooled = n * images.pooled() as usize;
@@ -395,7 +422,7 @@ fn adam_stages(b: &mut Builder, parts: &Parts, loss: Loss, learning_rate: f64) -
         match comparison {
             Comparison::PerPixel { kind, count, tile_target } => {
                 forward::render(b, network, saved, tile)?;
-                tile_ops::gather(b, tile, 3, target, tile_target)?;
+                tile_ops::gather(b, tile, 4, target, tile_target)?;
                 image_loss::backward(b, kind, tile.rows, rays_per_image, 1.0, saved.rgb(), tile_target, count, tile_d_rgb)?;
             }
             Comparison::Gmsd { d_rgb, .. } => {
@@ -429,7 +456,7 @@ fn levenberg_marquardt_stages(b: &mut Builder, parts: &Parts, soft: f32) -> Resu
     let n = hypotheses as usize;
     let len = |tile: &Tile| backward::partial_len(network, tile.rows).max(lm::partial_len(tile.rows));
     let partial = b.scratch("partial sums", cut.iter().map(len).max().unwrap_or(1))?;
-    let tile_target = b.scratch("tile target", 3 * most as usize)?;
+    let tile_target = b.scratch("tile target", 4 * most as usize)?;
     let mut seed = |name: &str| b.input(name, 3 * most as usize);
     let seeds = [seed("seed of red")?, seed("seed of green")?, seed("seed of blue")?];
     let values = n * lm::EQUATIONS as usize;
@@ -446,12 +473,12 @@ fn levenberg_marquardt_stages(b: &mut Builder, parts: &Parts, soft: f32) -> Resu
         d_origin: scratch.d_origin,
         d_direction: scratch.d_direction,
         rgb: saved.rgb(),
-        target_rgb: tile_target,
+        wanted: tile_target,
     };
     let scale = 1.0 / (3 * width * height) as f32;
     for &tile in cut {
         forward::render(b, network, saved, tile)?;
-        tile_ops::gather(b, tile, 3, target, tile_target)?;
+        tile_ops::gather(b, tile, 4, target, tile_target)?;
         for (number, d_rgb) in (0..).zip(seeds) {
             backward::render(b, network, saved, scratch, partial, tile, d_rgb, false, &mut started)?;
             let channel = Channel { number, seed: SEED, scale, soft };

@@ -17,6 +17,9 @@ pub struct Query {
     pub instance: u32,
     /// Colours in [-1, 1], `[height, width, 3]`, white background.
     pub rgb: Vec<f32>,
+    /// How much each pixel counts `[height, width]`, from 0, not at all: where something stands before the object, say. `None`: all
+    /// the same. GMSD takes none.
+    pub weights: Option<Vec<f32>>,
     /// Pixels per row.
     pub width: u32,
     /// Rows.
@@ -227,6 +230,14 @@ fn rays_of(query: &Query, stride: u32) -> impl Iterator<Item = (u32, u32)> {
     pixel_grid(query.width, query.height, stride)
 }
 
+/// Weights of the rays, scaled to a mean of 1: losses of pictures with masks and without are then of one kind.
+fn weights_of(query: &Query, stride: u32) -> Vec<f32> {
+    let weight = |(u, v): (u32, u32)| query.weights.as_ref().map_or(1.0, |weights| weights[(v * query.width + u) as usize]);
+    let weights: Vec<f32> = rays_of(query, stride).map(weight).collect();
+    let mean = weights.iter().sum::<f32>() / weights.len() as f32;
+    weights.into_iter().map(|weight| weight / mean).collect()
+}
+
 fn prepare(
     engine: &Engine,
     model: &Model,
@@ -239,7 +250,7 @@ fn prepare(
     instances.sort_unstable();
     instances.dedup();
     let mut random = stream(options.seed, 0);
-    let (mut slots, mut rays, mut target) = (Vec::new(), Rays::default(), Vec::new());
+    let (mut slots, mut rays, mut target, mut weights) = (Vec::new(), Rays::default(), Vec::new(), Vec::new());
     for hypothesis in running {
         let query = &queries[hypothesis.query];
         slots.push(instances.binary_search(&query.instance).expect("collected above") as u32);
@@ -248,6 +259,7 @@ fn prepare(
             let pixel = 3 * (v * query.width + u) as usize;
             target.extend_from_slice(&query.rgb[pixel..pixel + 3]);
         }
+        weights.extend(weights_of(query, phase.stride));
     }
     let across = |size: u32| (phase.stride / 2..size).step_by(phase.stride as usize).count() as u32;
     let shape = Shape {
@@ -257,7 +269,8 @@ fn prepare(
         instances: instances.len() as u32,
     };
     let mut descent = Descent::new(engine, model, shape, options.method)?;
-    descent.set_targets(&instances, &slots, &rays, &target)?;
+    let weighted = queries.iter().any(|query| query.weights.is_some());
+    descent.set_targets(&instances, &slots, &rays, &target, weighted.then_some(&weights))?;
     let poses: Vec<Pose6> = running.iter().map(|h| h.pose).collect();
     descent.set_poses(&poses)?;
     Ok(descent)
@@ -299,6 +312,15 @@ fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Erro
         }
         if options.phases.iter().any(|phase| rays_of(query, phase.stride).next().is_none()) {
             return input(format!("a stride larger than {} × {} pixels", query.width, query.height));
+        }
+        if let Some(weights) = &query.weights {
+            let pixels = query.rgb.len() / 3;
+            if weights.len() != pixels || weights.iter().any(|weight| !(0.0..f32::INFINITY).contains(weight)) {
+                return input(format!("needs {pixels} weights of 0 or more, finite"));
+            }
+            if options.phases.iter().any(|phase| weights_of(query, phase.stride).iter().any(|weight| !weight.is_finite())) {
+                return input("too few pixels count: a phase of the search sees none of them".into());
+            }
         }
     }
     Ok(())

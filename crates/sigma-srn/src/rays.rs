@@ -44,6 +44,17 @@ impl Rays {
     }
 }
 
+/// What the losses compare with: the colour of each ray and how much it counts, `[rays, 4]`; without `weights`, 1 for all.
+pub(crate) fn wanted(rgb: &[f32], weights: Option<&[f32]>) -> Vec<f32> {
+    let weights = weights.unwrap_or_default().iter().copied().chain(std::iter::repeat(1.0));
+    let mut wanted = Vec::with_capacity(rgb.len() / 3 * 4);
+    for (rgb, weight) in rgb.chunks(3).zip(weights) {
+        wanted.extend(rgb);
+        wanted.push(weight);
+    }
+    wanted
+}
+
 /// All pixels of an image in row-major order, or every `stride`-th of every `stride`-th row.
 pub fn pixel_grid(width: u32, height: u32, stride: u32) -> impl Iterator<Item = (u32, u32)> {
     let stride = stride.max(1);

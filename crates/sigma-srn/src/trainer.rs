@@ -10,6 +10,7 @@ use crate::engine::{Engine, Runner};
 use crate::model::{Model, Tensors, read_tensors, write_tensors};
 use crate::network::backward::{self, HyperScratch};
 use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, Started, Trainable, forward};
+use crate::rays::wanted;
 use crate::{Error, Rays};
 
 /// Weight of the image term.
@@ -136,7 +137,7 @@ impl Trainer {
         self.runner.write_u32(network.index, &batch.instances)?;
         self.runner.write_f64(network.world_from_camera, batch.rays.world_from_camera.as_flattened())?;
         batch.rays.write(&mut *self.runner, network)?;
-        self.runner.write(self.handles.target, &batch.target_rgb)?;
+        self.runner.write(self.handles.target, &wanted(&batch.target_rgb, None))?;
         self.runner.run(self.handles.gradients)?;
         Ok(())
     }
@@ -248,8 +249,8 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
     let sums =
         image_loss::partial_len(images, rays).max(depth_loss::partial_len(rows)).max(latent_loss::partial_len(codes_count));
     let partial = b.scratch("partial sums", partial_len.max(sums))?;
-    let target = b.input("target rgb", 3 * rows as usize)?;
-    let tile_target = b.scratch("tile target", 3 * most as usize)?;
+    let target = b.input("target", 4 * rows as usize)?;
+    let tile_target = b.scratch("tile target", 4 * most as usize)?;
     let d_rgb = b.scratch("tile d rgb", 3 * most as usize)?;
     let count = b.input("target count", images as usize)?;
     let (loss_images, loss_latent, loss_depth) =
@@ -260,7 +261,7 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
     forward::hypernetwork(b, &network, &hyper_saved)?;
     for &tile in &cut {
         forward::render(b, &network, &saved, tile)?;
-        tile_ops::gather(b, tile, 3, target, tile_target)?;
+        tile_ops::gather(b, tile, 4, target, tile_target)?;
         let scale = (IMAGE_WEIGHT / f64::from(images)) as f32;
         image_loss::backward(b, image_loss::Kind::Mse, tile.rows, rays, scale, saved.rgb(), tile_target, count, d_rgb)?;
         let scale = (DEPTH_WEIGHT / f64::from(rows)) as f32;

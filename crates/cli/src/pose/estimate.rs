@@ -6,9 +6,14 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::{Engine, Model};
+use sigma_srn::{Engine, Model, Pose6};
+use srn_data::camera::Axes;
 
-use super::files::{CameraArgs, Picture, PoseSource, create_dir, load_model, model_side, print, refuse_existing};
+use super::files::{
+    CameraArgs, Picture, PoseSource, create_dir, load_model, mask_of, model_side, print, refuse_existing, srn_instance,
+};
+use super::notation::{Notation, NotationArgs};
+use super::outline;
 use super::record::Log;
 use super::search::{Found, PoseError, SearchArgs, Starts};
 use crate::common::{EngineArgs, Result, progress};
@@ -16,7 +21,8 @@ use crate::common::{EngineArgs, Result, progress};
 /// Flags of `sigma-pose estimate`.
 #[derive(Args, Debug)]
 pub struct Estimate {
-    /// Pictures of any size and colour type; transparency becomes white. All are searched for in one batch.
+    /// Pictures of any size and colour type; transparency becomes white. A photograph that lies in no SRN folder is cut to a square
+    /// around what transparency and --mask leave of it; with neither, to its middle. All are searched for in one batch.
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
     /// Model, or checkpoint of a training run.
@@ -27,6 +33,10 @@ pub struct Estimate {
     instance: Option<String>,
     #[command(flatten)]
     camera: CameraArgs,
+    /// What counts in a picture: white, or opaque. What is black (something before the object, a cluttered background) has no part in the
+    /// search. A file, once or once per picture, or a folder with files called like the pictures.
+    #[arg(long, value_name = "FILE|DIR")]
+    mask: Vec<PathBuf>,
     /// Where to start: `around84`, all around; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file
     /// with 16 numbers per line, a `world_from_camera` each. Default: `neighbor4` with --rough, else `around84`.
     #[arg(long, value_name = "around84|fixed24|neighbor4|FILE")]
@@ -40,7 +50,7 @@ pub struct Estimate {
     /// Print everything as JSON.
     #[arg(long)]
     json: bool,
-    /// Write a picture and an animation of each search to this folder.
+    /// Write to this folder, of each search, a picture, an animation, and the found object's outline on the picture as it was given.
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
     /// Overwrite pictures in the folder of --record.
@@ -48,6 +58,8 @@ pub struct Estimate {
     force: bool,
     #[command(flatten)]
     engine: EngineArgs,
+    #[command(flatten)]
+    poses: NotationArgs,
     // Last, for its heading holds for all flags that follow.
     #[command(flatten)]
     search: SearchArgs,
@@ -60,6 +72,8 @@ struct Report {
     executor: String,
     /// Seconds of the search for all pictures.
     seconds: f64,
+    /// Axes of the cameras in all poses.
+    convention: Axes,
     images: Vec<ImageReport>,
 }
 
@@ -67,11 +81,13 @@ struct Report {
 struct ImageReport {
     image: PathBuf,
     instance: String,
-    /// Rows of the 4×4 matrix.
+    /// Rows of the 4×4 matrix, in the data set's frame and object units.
     world_from_camera: [[f64; 4]; 4],
-    /// θ1, θ2, θ3 of `R = Rx(θ1)·Ry(θ2)·Rz(θ3)`.
+    /// The same in frame and units of the photographs that were imported: by --frame, or the frame.json of the picture's instance.
+    source_from_camera: Option<[[f64; 4]; 4]>,
+    /// θ1, θ2, θ3 of `R = Rx(θ1)·Ry(θ2)·Rz(θ3)` of `world_from_camera`.
     euler_rad: [f64; 3],
-    /// Camera centre, object units.
+    /// Its camera centre, object units.
     translation: [f64; 3],
     loss: f64,
     /// See [`Found::unexplained`].
@@ -97,14 +113,17 @@ struct RankedReport {
 pub fn run(args: &Estimate) -> Result<bool> {
     let model = load_model(&args.model)?;
     let side = model_side(&model, &args.images[0])?;
-    let rough = poses("--rough", &args.rough, &args.images)?;
-    let pictures = pictures(args, &model, side)?;
+    let notation = args.poses.open()?;
+    let rough = poses("--rough", &args.rough, &args.images, &notation)?;
+    let pictures = pictures(args, &model, side, &notation)?;
+    let sources = args.images.iter().map(|path| args.poses.source(srn_instance(path).as_deref())).collect::<Result<Vec<_>>>()?;
     let default = if args.rough.is_empty() { Starts::Around84 } else { Starts::Neighbor4 };
     let starts = args.starts.as_ref().unwrap_or(&default);
-    let starts = rough.iter().map(|rough| args.search.starts(starts, &model, rough.as_ref())).collect::<Result<Vec<_>>>()?;
+    let starts =
+        rough.iter().map(|rough| args.search.starts(starts, &model, rough.as_ref(), &notation)).collect::<Result<Vec<_>>>()?;
     if let Some(dir) = &args.record {
-        let files =
-            ["png", "gif"].into_iter().flat_map(|kind| pictures.iter().map(move |p| dir.join(format!("{}.{kind}", p.name))));
+        let of = |end: &'static str| pictures.iter().map(move |p| dir.join(format!("{}{end}", p.name)));
+        let files = [".png", ".gif", "-outline.png"].into_iter().flat_map(of);
         refuse_existing(files, args.force)?;
         create_dir(dir)?;
     }
@@ -119,36 +138,45 @@ pub fn run(args: &Estimate) -> Result<bool> {
     })?;
     bar.finish_and_clear();
 
-    let report = report(args, &engine, &model, &pictures, &found);
+    let report = report(args, &engine, &model, &pictures, &found, &sources);
     if args.json {
         print(&serde_json::to_string_pretty(&report)?)?;
     } else {
-        report.images.iter().try_for_each(|image| print(&image.line()))?;
+        let poses = found.iter().map(|found| Pose6::from_matrix(&notation.written(&found.world_from_camera)));
+        report.images.iter().zip(poses).try_for_each(|(image, pose)| print(&image.line(&pose)))?;
     }
     if let Some(dir) = &args.record {
         for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
             log.write(dir, i, picture, found, &engine, &model, side)?;
+            outline::write(dir, &args.images[i], picture, found, &engine, &model, side)?;
         }
         eprintln!("pictures in {}", dir.display());
     }
     Ok(found.iter().all(|found| found.converged))
 }
 
-/// One pose per image from none, one or as many sources.
-fn poses(flag: &str, sources: &[PoseSource], images: &[PathBuf]) -> Result<Vec<Option<DMat4>>> {
-    if ![0, 1, images.len()].contains(&sources.len()) {
-        return Err(format!("{flag}: {} poses for {} pictures; give one, or one for each", sources.len(), images.len()).into());
+/// One of `things` per image, of which there are none, one or as many.
+fn each<'a, T>(flag: &str, what: &str, things: &'a [T], images: &'a [PathBuf]) -> Result<Vec<(&'a PathBuf, Option<&'a T>)>> {
+    if ![0, 1, images.len()].contains(&things.len()) {
+        return Err(format!("{flag}: {} {what} for {} pictures; give one, or one for each", things.len(), images.len()).into());
     }
-    let read = |(i, image): (usize, &PathBuf)| sources.get(i % sources.len().max(1)).map(|s| s.read(image)).transpose();
-    images.iter().enumerate().map(read).collect()
+    Ok(images.iter().enumerate().map(|(i, image)| (image, things.get(i % things.len().max(1)))).collect())
 }
 
-fn pictures(args: &Estimate, model: &Model, side: u32) -> Result<Vec<Picture>> {
-    let truths = poses("--truth", &args.truth, &args.images)?;
+fn poses(flag: &str, sources: &[PoseSource], images: &[PathBuf], notation: &Notation) -> Result<Vec<Option<DMat4>>> {
+    let read = |(image, source): (&PathBuf, Option<&PoseSource>)| source.map(|s| s.read(image, notation)).transpose();
+    each(flag, "poses", sources, images)?.into_iter().map(read).collect()
+}
+
+fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> Result<Vec<Picture>> {
+    let truths = poses("--truth", &args.truth, &args.images, notation)?;
+    let masks = each("--mask", "masks", &args.mask, &args.images)?;
     let mut names = HashSet::new();
     let mut pictures = Vec::new();
-    for (path, truth) in args.images.iter().zip(truths) {
-        let mut picture = Picture { truth, ..Picture::open(path, model, side, args.instance.as_deref(), &args.camera)? };
+    for ((path, mask), truth) in masks.into_iter().zip(truths) {
+        let mask = mask.map(|mask| mask_of(mask, path)).transpose()?;
+        let picture = Picture::open(path, mask.as_deref(), model, side, args.instance.as_deref(), &args.camera)?;
+        let mut picture = Picture { truth, ..picture };
         while !names.insert(picture.name.clone()) {
             picture.name += "-again";
         }
@@ -157,9 +185,18 @@ fn pictures(args: &Estimate, model: &Model, side: u32) -> Result<Vec<Picture>> {
     Ok(pictures)
 }
 
-fn report(args: &Estimate, engine: &Engine, model: &Model, pictures: &[Picture], found: &[Found]) -> Report {
-    let image = |((image, picture), found): ((&PathBuf, &Picture), &Found)| {
-        let [a, b, c, x, y, z] = found.estimate.pose.0;
+fn report(
+    args: &Estimate,
+    engine: &Engine,
+    model: &Model,
+    pictures: &[Picture],
+    found: &[Found],
+    sources: &[Option<Notation>],
+) -> Report {
+    let convention = args.poses.convention;
+    let image = |(((image, picture), found), source): (((&PathBuf, &Picture), &Found), &Option<Notation>)| {
+        let world_from_camera = convention.of_ours(found.world_from_camera);
+        let [a, b, c, x, y, z] = Pose6::from_matrix(&world_from_camera).0;
         let error = |pose: &DMat4| picture.truth.map(|truth| PoseError::of(pose, &truth));
         let ranked = |r: &sigma_srn::Ranked| RankedReport {
             start: r.start,
@@ -170,7 +207,8 @@ fn report(args: &Estimate, engine: &Engine, model: &Model, pictures: &[Picture],
         ImageReport {
             image: image.clone(),
             instance: model.instance_name(picture.instance),
-            world_from_camera: found.world_from_camera.transpose().to_cols_array_2d(),
+            world_from_camera: world_from_camera.transpose().to_cols_array_2d(),
+            source_from_camera: source.map(|source| source.rows(&found.world_from_camera)),
             euler_rad: [a, b, c],
             translation: [x, y, z],
             loss: found.estimate.loss,
@@ -185,15 +223,16 @@ fn report(args: &Estimate, engine: &Engine, model: &Model, pictures: &[Picture],
     Report {
         executor: engine.to_string(),
         seconds: found.iter().map(|found| found.seconds).sum(),
-        images: args.images.iter().zip(pictures).zip(found).map(image).collect(),
+        convention,
+        images: args.images.iter().zip(pictures).zip(found).zip(sources).map(image).collect(),
     }
 }
 
 impl ImageReport {
-    /// What is printed without `--json`.
-    fn line(&self) -> String {
-        let [a, b, c] = self.euler_rad.map(f64::to_degrees);
-        let [x, y, z] = self.translation;
+    /// What is printed without `--json`, the pose as it was asked for.
+    fn line(&self, pose: &Pose6) -> String {
+        let [a, b, c, x, y, z] = pose.0;
+        let [a, b, c] = [a, b, c].map(f64::to_degrees);
         let verdict = if self.converged { "" } else { "  NOT CONVERGED" };
         let error = self.error.map_or(String::new(), |error| format!("  error {error}"));
         format!(

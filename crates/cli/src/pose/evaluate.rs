@@ -5,11 +5,13 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
+use srn_data::camera::Axes;
 use srn_data::sheet;
 use srn_data::srn::{InstanceFiles, SrnSet};
 
 use super::draw;
 use super::files::{Picture, create_dir, load_model, model_side, print, refuse_existing, write_png};
+use super::notation::{Notation, NotationArgs};
 use super::search::{Found, PoseError, SearchArgs, Starts};
 use crate::common::{EngineArgs, Result, camera, progress};
 
@@ -48,6 +50,8 @@ pub struct Evaluate {
     force: bool,
     #[command(flatten)]
     engine: EngineArgs,
+    #[command(flatten)]
+    poses: NotationArgs,
     // Last, for its heading holds for all flags that follow.
     #[command(flatten)]
     search: SearchArgs,
@@ -60,6 +64,8 @@ struct Report {
     command: Vec<String>,
     /// `cpu`, or the adapter's name.
     executor: String,
+    /// Axes of the cameras in all poses.
+    convention: Axes,
     overall: Summary,
     instances: Vec<Summary>,
     views: Vec<ViewReport>,
@@ -73,6 +79,9 @@ struct Summary {
     converged: usize,
     rotation_deg: Statistics,
     translation: Statistics,
+    translation_percent: Statistics,
+    /// Translation in units of the source; where all instances were imported.
+    translation_source: Option<Statistics>,
     /// Parts of the views with a rotation error of at most 5° and 10°.
     recall_5_deg: f64,
     recall_10_deg: f64,
@@ -92,6 +101,8 @@ struct ViewReport {
     instance: String,
     view: String,
     error: PoseError,
+    /// The error of the translation in units of the source, if the instance was imported.
+    translation_source: Option<f64>,
     /// Errors of the start that came nearest in rotation.
     oracle: PoseError,
     start: usize,
@@ -101,6 +112,8 @@ struct ViewReport {
     seconds: f64,
     /// Rows of the estimate.
     world_from_camera: [[f64; 4]; 4],
+    /// The same in frame and units of the source, if the instance was imported.
+    source_from_camera: Option<[[f64; 4]; 4]>,
 }
 
 /// Runs the command.
@@ -126,17 +139,22 @@ pub fn run(args: &Evaluate) -> Result<bool> {
         let instance = model.instance(&files.name)?;
         let picture = |view: srn_data::LoadedView| {
             let (truth, intrinsics) = camera(&view);
-            (Picture { name: view.name, instance, rgb: view.rgb, intrinsics, truth: Some(truth) }, truth)
+            let square = ([0; 2], side as usize);
+            let (name, rgb) = (view.name, view.rgb);
+            (Picture { name, instance, rgb, weights: None, intrinsics, truth: Some(truth), square }, truth)
         };
         Ok(files.load(side as usize)?.views.into_iter().map(picture).collect())
     };
+    let notation = args.poses.open()?;
     // All are read, and the starts known, before the first is searched for.
     let mut queries = Vec::new();
     for files in &instances {
         let (pictures, truths): (Vec<_>, Vec<_>) = pictures(files)?.into_iter().unzip();
-        let starts =
-            truths.iter().map(|truth| args.search.starts(&args.starts, &model, Some(truth))).collect::<Result<Vec<_>>>()?;
-        queries.push((&files.name, pictures, truths, starts));
+        let starts = truths
+            .iter()
+            .map(|truth| args.search.starts(&args.starts, &model, Some(truth), &notation))
+            .collect::<Result<Vec<_>>>()?;
+        queries.push((&files.name, args.poses.source(Some(&files.dir))?, pictures, truths, starts));
     }
     let files = ["results.json", "pictures.png"];
     if let Some(dir) = &args.out {
@@ -149,14 +167,17 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     let steps: u64 = options.phases.iter().map(|phase| u64::from(phase.steps)).sum();
     let bar = progress(steps * instances.len() as u64, "steps");
     let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();
-    for (i, (name, pictures, truths, starts)) in queries.iter().enumerate() {
+    for (i, (name, source, pictures, truths, starts)) in queries.iter().enumerate() {
         bar.set_message(name.to_string());
         let found = args.search.run(&engine, &model, side, pictures, starts, |progress| {
             bar.set_position(i as u64 * steps + u64::from(progress.step));
             Ok(())
         })?;
         let reports = pictures.iter().zip(truths).zip(found);
-        results.extend(reports.map(|((picture, truth), found)| (view_report(name, picture, truth, &found), picture, found)));
+        for ((picture, truth), found) in reports {
+            let report = view_report(name, picture, truth, &found, notation.axes, source.as_ref());
+            results.push((report, picture, found));
+        }
     }
     bar.finish_and_clear();
 
@@ -166,6 +187,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     let report = Report {
         command: std::env::args().collect(),
         executor: engine.to_string(),
+        convention: notation.axes,
         overall: Summary::of("all", &views.iter().collect::<Vec<_>>()),
         instances: instances.iter().map(|files| of(&files.name)).collect(),
         views,
@@ -187,20 +209,29 @@ fn spread<T>(items: Vec<T>, n: usize) -> Vec<T> {
     items.into_iter().enumerate().filter(|(i, _)| chosen.contains(i)).map(|(_, item)| item).collect()
 }
 
-fn view_report(instance: &str, picture: &Picture, truth: &DMat4, found: &Found) -> ViewReport {
+fn view_report(
+    instance: &str,
+    picture: &Picture,
+    truth: &DMat4,
+    found: &Found,
+    convention: Axes,
+    source: Option<&Notation>,
+) -> ViewReport {
     let errors = found.estimate.ranking.iter().map(|r| PoseError::of(&r.pose.to_matrix(), truth));
     let error = PoseError::of(&found.world_from_camera, truth);
     ViewReport {
         instance: instance.into(),
         view: picture.name.clone(),
         error,
+        translation_source: source.map(|source| error.translation * source.unit()),
         oracle: errors.min_by(|a, b| a.rotation_deg.total_cmp(&b.rotation_deg)).unwrap_or(error),
         start: found.estimate.ranking[0].start,
         loss: found.estimate.loss,
         unexplained: found.unexplained,
         converged: found.converged,
         seconds: found.seconds,
-        world_from_camera: found.world_from_camera.transpose().to_cols_array_2d(),
+        world_from_camera: convention.of_ours(found.world_from_camera).transpose().to_cols_array_2d(),
+        source_from_camera: source.map(|source| source.rows(&found.world_from_camera)),
     }
 }
 
@@ -243,6 +274,7 @@ impl Summary {
     /// Of at least one view.
     fn of(name: &str, views: &[&ViewReport]) -> Self {
         let n = views.len() as f64;
+        let in_source: Option<Vec<f64>> = views.iter().map(|view| view.translation_source).collect();
         let part = |limit: f64| views.iter().filter(|view| view.error.rotation_deg <= limit).count() as f64 / n;
         Summary {
             name: name.into(),
@@ -250,6 +282,8 @@ impl Summary {
             converged: views.iter().filter(|view| view.converged).count(),
             rotation_deg: Statistics::of(views.iter().map(|view| view.error.rotation_deg)),
             translation: Statistics::of(views.iter().map(|view| view.error.translation)),
+            translation_percent: Statistics::of(views.iter().map(|view| view.error.translation_percent)),
+            translation_source: in_source.map(|errors| Statistics::of(errors.into_iter())),
             recall_5_deg: part(5.0),
             recall_10_deg: part(10.0),
             oracle_deg: Statistics::of(views.iter().map(|view| view.oracle.rotation_deg)),
@@ -272,6 +306,10 @@ impl Report {
             "median",
             "tra mean",
             "median",
+            "% of distance",
+            "median",
+            "in source",
+            "median",
             "converged",
             "s/view",
         ];
@@ -280,6 +318,8 @@ impl Report {
             let [rotation, rotation_median] = degrees(s.rotation_deg);
             let [oracle, oracle_median] = degrees(s.oracle_deg);
             let [translation, translation_median] = [s.translation.mean, s.translation.median].map(|x| format!("{x:.3}"));
+            let [percent, percent_median] = [s.translation_percent.mean, s.translation_percent.median].map(|x| format!("{x:.2}"));
+            let in_source = |pick: fn(Statistics) -> f64| s.translation_source.map_or("-".into(), |s| significant(pick(s)));
             let [recall_5, recall_10] = [s.recall_5_deg, s.recall_10_deg].map(|x| format!("{x:.2}"));
             [
                 s.name.clone(),
@@ -292,6 +332,10 @@ impl Report {
                 oracle_median,
                 translation,
                 translation_median,
+                percent,
+                percent_median,
+                in_source(|s| s.mean),
+                in_source(|s| s.median),
                 s.converged.to_string(),
                 format!("{:.2}", s.seconds_per_view),
             ]
@@ -299,8 +343,8 @@ impl Report {
         let mut rows = vec![head.map(String::from)];
         rows.extend(self.instances.iter().chain([&self.overall]).map(row));
         let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-        let widths: [usize; 12] = std::array::from_fn(width);
-        let line = |row: &[String; 12]| {
+        let widths: [usize; 16] = std::array::from_fn(width);
+        let line = |row: &[String; 16]| {
             let cells: Vec<_> = row.iter().zip(widths).map(|(cell, width)| format!(" {cell:>width$} ")).collect();
             format!("|{}|", cells.join("|"))
         };
@@ -309,6 +353,12 @@ impl Report {
         lines.insert(1, format!("|{}|", rule.join("|")));
         lines.join("\n")
     }
+}
+
+/// Three digits that count: units of sources are anything from metres to millimetres.
+fn significant(x: f64) -> String {
+    let digits = if x > 0.0 { (2.0 - x.log10().floor()).clamp(0.0, 6.0) as usize } else { 0 };
+    format!("{x:.digits$}")
 }
 
 #[cfg(test)]
@@ -321,6 +371,11 @@ mod tests {
         assert_eq!(spread((0..3).collect(), 10), [0, 1, 2]);
         assert_eq!(spread((0..7).collect(), 3), [0, 2, 4]);
         assert!(spread(Vec::<u8>::new(), 3).is_empty());
+    }
+
+    #[test]
+    fn three_digits_count() {
+        assert_eq!([0.009_123, 9.123, 912.3, 0.0].map(significant), ["0.00912", "9.12", "912", "0"]);
     }
 
     #[test]

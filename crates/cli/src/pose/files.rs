@@ -7,8 +7,11 @@ use glam::DMat4;
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::{Delay, Frame, ImageFormat, RgbImage};
 use sigma_srn::{Intrinsics, Model, write_atomically};
-use srn_data::srn::{self, load_square, picture_size};
+use srn_data::formats::mask_in;
+use srn_data::srn::{self, picture_size};
+use srn_data::target::Target;
 
+use super::notation::Notation;
 use super::positive;
 use crate::common::Result;
 
@@ -51,7 +54,7 @@ impl CameraArgs {
     }
 }
 
-/// A pose file, or the one that belongs to a picture in an SRN folder.
+/// A pose file, or the one that belongs to a picture in an SRN folder, which is as data sets are.
 #[derive(Clone, Debug)]
 pub enum PoseSource {
     /// `../pose/NAME.txt` of `rgb/NAME.png`.
@@ -68,9 +71,9 @@ impl From<&str> for PoseSource {
 
 impl PoseSource {
     /// Reads the pose for a picture.
-    pub fn read(&self, picture: &Path) -> Result<DMat4> {
+    pub fn read(&self, picture: &Path, notation: &Notation) -> Result<DMat4> {
         let path = match self {
-            PoseSource::File(path) => path.clone(),
+            PoseSource::File(path) => return Ok(notation.ours(srn::read_pose(path)?)),
             PoseSource::Auto => {
                 let name = picture.with_extension("txt");
                 let dir = srn_instance(picture).ok_or_else(|| {
@@ -84,7 +87,7 @@ impl PoseSource {
 }
 
 /// The instance folder of a picture `INSTANCE/rgb/NAME.png`.
-fn srn_instance(picture: &Path) -> Option<PathBuf> {
+pub fn srn_instance(picture: &Path) -> Option<PathBuf> {
     let path = std::fs::canonicalize(picture).ok()?;
     let folder = path.parent()?;
     let is_rgb = folder.file_name()? == "rgb";
@@ -100,15 +103,27 @@ pub struct Picture {
     pub instance: u32,
     /// Colours in [-1, 1], `[side, side, 3]`.
     pub rgb: Vec<f32>,
+    /// How much each pixel counts `[side, side]`; `None`: all the same.
+    pub weights: Option<Vec<f32>>,
     /// Intrinsics of the resampled picture.
     pub intrinsics: Intrinsics,
     /// Its true `world_from_camera`, if known.
     pub truth: Option<DMat4>,
+    /// Where the square lies in the picture as it is on disk: first pixel, width and height.
+    pub square: ([i64; 2], usize),
 }
 
 impl Picture {
-    /// Reads a picture as a square of `side` pixels. In an SRN folder the intrinsics and the instance's name are found beside it.
-    pub fn open(path: &Path, model: &Model, side: u32, instance: Option<&str>, camera: &CameraArgs) -> Result<Self> {
+    /// Reads a picture as a square of `side` pixels. In an SRN folder the intrinsics and the instance's name are found beside it; a
+    /// picture from elsewhere is cut around what its mask and transparency leave.
+    pub fn open(
+        path: &Path,
+        mask: Option<&Path>,
+        model: &Model,
+        side: u32,
+        instance: Option<&str>,
+        camera: &CameraArgs,
+    ) -> Result<Self> {
         let about = |what: &str| format!("{}: {what}", path.display());
         let dir = srn_instance(path);
         let size = picture_size(path)?;
@@ -122,16 +137,24 @@ impl Picture {
         let folder = dir.as_deref().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
         let instance = instance.map(String::from).or(folder).ok_or_else(|| about("which object is it? Give --instance"))?;
         let instance = model.instance(&instance)?;
-        let (pixels, [fx, fy, cx, cy]) = load_square(path, &intrinsics, side as usize)?;
-        let [fx, fy, cx, cy] = [fx, fy, cx, cy].map(f64::from);
+        let read = if dir.is_some() { Target::of_view } else { Target::of_photo };
+        let target = read(path, mask, &intrinsics, side as usize)?;
+        let [fx, fy, cx, cy] = target.intrinsics.map(f64::from);
         Ok(Picture {
             name: format!("{}-{stem}", model.instance_name(instance)),
             instance,
-            rgb: pixels.data,
+            rgb: target.rgb,
+            weights: target.weights,
             intrinsics: Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 },
             truth: None,
+            square: (target.corner, target.extent),
         })
     }
+}
+
+/// The mask of a picture: this file, or the one in this folder that is called like the picture.
+pub fn mask_of(mask: &Path, picture: &Path) -> Result<PathBuf> {
+    if mask.is_dir() { Ok(mask_in(mask, picture)?) } else { Ok(mask.into()) }
 }
 
 /// Side of the pictures that a model takes: as it was trained, or else the shorter side of `picture`.

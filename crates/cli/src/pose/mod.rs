@@ -4,6 +4,8 @@ mod draw;
 pub mod estimate;
 pub mod evaluate;
 mod files;
+mod notation;
+mod outline;
 mod record;
 pub mod render;
 mod search;

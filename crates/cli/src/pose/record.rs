@@ -141,8 +141,17 @@ impl Page<'_> {
     }
 
     fn target(&self) -> Panel {
-        let view = draw::view(&self.picture.rgb, self.side, SHOWN);
-        Panel { heading: "TARGET".into(), view, captions: vec!["the picture given".into()] }
+        let rgb = self.counted(&self.picture.rgb, [-0.2, -0.2, 0.2]);
+        let mut captions = vec!["the picture given".into()];
+        captions.extend(self.picture.weights.as_ref().map(|_| "blue-grey: masked out".into()));
+        Panel { heading: "TARGET".into(), view: draw::view(&rgb, self.side, SHOWN), captions }
+    }
+
+    /// Colours, `instead` where pixels do not count.
+    fn counted(&self, rgb: &[f32], instead: [f32; 3]) -> Vec<f32> {
+        let weight = |pixel: usize| self.picture.weights.as_ref().map_or(1.0, |weights| weights[pixel]);
+        let mix = |(value, &colour): (usize, &f32)| weight(value / 3) * colour + (1.0 - weight(value / 3)) * instead[value % 3];
+        rgb.iter().enumerate().map(mix).collect()
     }
 
     fn step(&self, heading: String, render: &[f32], k: usize) -> Panel {
@@ -150,7 +159,8 @@ impl Page<'_> {
     }
 
     fn difference(&self, render: &[f32]) -> Panel {
-        let view = draw::difference(&self.picture.rgb, render, self.side, SHOWN);
+        let [picture, render] = [&self.picture.rgb, render].map(|rgb| self.counted(rgb, [1.0; 3]));
+        let view = draw::difference(&picture, &render, self.side, SHOWN);
         Panel { heading: "DIFFERENCE".into(), view, captions: vec!["white: none, black: much".into()] }
     }
 

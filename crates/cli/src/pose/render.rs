@@ -12,6 +12,7 @@ use srn_data::sheet::VIRIDIS;
 use srn_data::srn::{self, InstanceWriter, read_pose};
 
 use super::files::{CameraArgs, load_model, print, refuse_existing, write_gif, write_png};
+use super::notation::NotationArgs;
 use super::search::render;
 use super::{draw, positive};
 use crate::common::{EngineArgs, Result};
@@ -62,6 +63,8 @@ pub struct Render {
     force: bool,
     #[command(flatten)]
     engine: EngineArgs,
+    #[command(flatten)]
+    poses: NotationArgs,
 }
 
 fn angle(text: &str) -> std::result::Result<f64, String> {
@@ -84,7 +87,7 @@ pub fn run(args: &Render) -> Result<bool> {
     let side = args.side.unwrap_or(trained_side);
     let radius = args.radius.or(model.metadata.orbit_radius).unwrap_or(RADIUS);
     let poses = match &args.pose {
-        Some(path) => vec![read_pose(path)?],
+        Some(path) => vec![args.poses.open()?.ours(read_pose(path)?)],
         None => orbit(args.orbit.unwrap_or(1), args.azimuth, args.elevation, radius),
     };
     let files_intrinsics = match args.camera.intrinsics([side as usize; 2])? {

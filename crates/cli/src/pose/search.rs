@@ -13,6 +13,7 @@ use sigma_srn::{
 };
 
 use super::files::Picture;
+use super::notation::Notation;
 use super::positive;
 use crate::common::Result;
 
@@ -138,6 +139,7 @@ impl SearchArgs {
         let query = |(picture, starts): (&Picture, &Vec<DMat4>)| Query {
             instance: picture.instance,
             rgb: picture.rgb.clone(),
+            weights: picture.weights.clone(),
             width: side,
             height: side,
             intrinsics: picture.intrinsics,
@@ -152,7 +154,7 @@ impl SearchArgs {
         let views: Vec<View> = pictures.iter().zip(&estimates).map(view).collect();
         let renders = render(engine, model, side, &views)?;
         let found = estimates.into_iter().zip(renders).zip(pictures).map(|((estimate, render), picture)| {
-            let unexplained = unexplained(&picture.rgb, &render.rgb);
+            let unexplained = unexplained(picture, &render.rgb);
             let converged = estimate.loss.is_finite() && unexplained <= self.accept;
             Found { world_from_camera: estimate.pose.to_matrix(), estimate, rgb: render.rgb, unexplained, converged, seconds }
         });
@@ -165,7 +167,7 @@ impl SearchArgs {
     }
 
     /// The poses to start from; `rough` is the one that `neighbor4` turns.
-    pub fn starts(&self, starts: &Starts, model: &Model, rough: Option<&DMat4>) -> Result<Vec<DMat4>> {
+    pub fn starts(&self, starts: &Starts, model: &Model, rough: Option<&DMat4>, notation: &Notation) -> Result<Vec<DMat4>> {
         match starts {
             Starts::Around84 => Ok(around84(self.radius(model)?)),
             Starts::Fixed24 => Ok(fixed24(self.radius(model)?)),
@@ -173,7 +175,7 @@ impl SearchArgs {
             Starts::File(path) if !path.exists() => {
                 Err(format!("--starts {}: no such file; expected around84, fixed24, neighbor4 or a file", path.display()).into())
             }
-            Starts::File(path) => Ok(srn_data::srn::read_poses(path)?),
+            Starts::File(path) => Ok(srn_data::srn::read_poses(path)?.into_iter().map(|pose| notation.ours(pose)).collect()),
         }
     }
 }
@@ -188,7 +190,7 @@ pub struct Found {
     /// The model's view from there `[side, side, 3]`.
     pub rgb: Vec<f32>,
     /// The part of the picture that the render leaves unexplained: the sum of absolute differences to the render, over that to
-    /// an empty (white) picture. 0: equal; 1: no better than nothing.
+    /// an empty (white) picture, of the pixels that count. 0: equal; 1: no better than nothing.
     pub unexplained: f64,
     /// Whether the loss is finite, and that little enough.
     pub converged: bool,
@@ -203,13 +205,16 @@ pub struct PoseError {
     pub rotation_deg: f64,
     /// Distance of the camera centres, object units.
     pub translation: f64,
+    /// The same in percent of the true camera's distance from the object's centre.
+    pub translation_percent: f64,
 }
 
 impl PoseError {
     /// Of `pose` against `truth`.
     pub fn of(pose: &DMat4, truth: &DMat4) -> Self {
         let (rotation_deg, translation) = pose_error(pose, truth);
-        PoseError { rotation_deg, translation }
+        let translation_percent = 100.0 * translation / truth.w_axis.truncate().length();
+        PoseError { rotation_deg, translation, translation_percent }
     }
 }
 
@@ -220,10 +225,13 @@ impl std::fmt::Display for PoseError {
 }
 
 /// Sum of absolute differences to `render`, over that to a white picture; not a number if the render has one.
-fn unexplained(picture: &[f32], render: &[f32]) -> f64 {
-    let sum = |differences: &mut dyn Iterator<Item = f32>| differences.map(|d| f64::from(d.abs())).sum::<f64>();
-    let left = sum(&mut picture.iter().zip(render).map(|(p, r)| p - r.clamp(-1.0, 1.0)));
-    left / sum(&mut picture.iter().map(|p| p - 1.0))
+fn unexplained(picture: &Picture, render: &[f32]) -> f64 {
+    let weight = |value: usize| picture.weights.as_ref().map_or(1.0, |weights| weights[value / 3]);
+    let sum = |difference: &dyn Fn(usize) -> f32| {
+        (0..picture.rgb.len()).map(|value| f64::from(weight(value) * difference(value).abs())).sum::<f64>()
+    };
+    let rgb = &picture.rgb;
+    sum(&|value| rgb[value] - render[value].clamp(-1.0, 1.0)) / sum(&|value| rgb[value] - 1.0)
 }
 
 /// Instance, `world_from_camera` and intrinsics of a view.
@@ -253,10 +261,19 @@ mod tests {
 
     #[test]
     fn unexplained_is_relative_to_an_empty_picture() {
+        let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pixel_center: 0.0 };
+        let of = |rgb: &[f32], weights: Option<&[f32]>, render: &[f32]| {
+            let (rgb, weights) = (rgb.to_vec(), weights.map(<[f32]>::to_vec));
+            let picture =
+                Picture { name: String::new(), instance: 0, rgb, weights, intrinsics, truth: None, square: ([0; 2], 1) };
+            unexplained(&picture, render)
+        };
         let picture = [0.5, 1.0, -0.5];
-        assert_eq!(unexplained(&picture, &picture), 0.0);
-        assert_eq!(unexplained(&picture, &[1.0, 1.7, 1.0]), 1.0);
-        assert_eq!(unexplained(&picture, &[0.5, 1.0, -1.5]), 0.25);
-        assert!(unexplained(&picture, &[0.5, f32::NAN, -0.5]).is_nan() && unexplained(&[1.0; 3], &[1.0; 3]).is_nan());
+        assert_eq!(of(&picture, None, &picture), 0.0);
+        assert_eq!(of(&picture, None, &[1.0, 1.7, 1.0]), 1.0);
+        assert_eq!(of(&picture, None, &[0.5, 1.0, -1.5]), 0.25);
+        assert!(of(&picture, None, &[0.5, f32::NAN, -0.5]).is_nan() && of(&[1.0; 3], None, &[1.0; 3]).is_nan());
+        let two = [0.5, 1.0, -0.5, -1.0, -1.0, -1.0];
+        assert_eq!(of(&two, Some(&[1.0, 0.0]), &[0.5, 1.0, -1.5, 1.0, 1.0, 1.0]), 0.25);
     }
 }

@@ -14,35 +14,38 @@ fn normaliser<T: Real>(p: ImageLossParams, count: T) -> T {
     T::one() / if p.kind < 2 { T::of(p.values_per_image.into()) } else { T::one() + count }
 }
 
-/// `f` summed over the values of each chunk of each image's rows.
-fn sums<T: Real>(p: ImageLossParams, partial: &mut [T], f: impl Fn(usize, usize) -> T) {
+/// `f` of image, row and channel, times the row's weight, summed over each chunk of each image's rows.
+fn sums<T: Real>(p: ImageLossParams, wanted: &[T], partial: &mut [T], f: impl Fn(usize, usize, usize) -> T) {
     for (index, partial) in partial.iter_mut().take((p.groups * p.chunks) as usize).enumerate() {
         let (group, chunk) = (index / p.chunks as usize, index % p.chunks as usize);
         let rows = chunk_of(chunk, p.chunk_rows, p.rows_per_group);
         let first = group * p.rows_per_group as usize;
-        let sum = (3 * (first + rows.start)..3 * (first + rows.end)).map(|value| f(group, value).wide()).sum::<f64>();
+        let row = |row: usize| (0..3).map(move |channel| (row, channel));
+        let values = (first + rows.start..first + rows.end).flat_map(row);
+        let sum = values.map(|(row, channel)| (wanted[4 * row + 3] * f(group, row, channel)).wide()).sum::<f64>();
         *partial = T::of(sum);
     }
 }
 
-/// Target values that are not exactly 1.
-pub fn count<T: Real>(p: ImageLossParams, target_rgb: &[T], partial: &mut [T]) {
-    sums(p, partial, |_, value| if target_rgb[value] == T::one() { T::zero() } else { T::one() });
+/// Wanted values that are not exactly 1, by their weights.
+pub fn count<T: Real>(p: ImageLossParams, wanted: &[T], partial: &mut [T]) {
+    sums(p, wanted, partial, |_, row, channel| if wanted[4 * row + channel] == T::one() { T::zero() } else { T::one() });
 }
 
 /// Partial sums of the loss.
-pub fn forward<T: Real>(p: ImageLossParams, rgb: &[T], target_rgb: &[T], count: &[T], partial: &mut [T]) {
-    sums(p, partial, |group, value| {
-        let e = rgb[value] - target_rgb[value];
+pub fn forward<T: Real>(p: ImageLossParams, rgb: &[T], wanted: &[T], count: &[T], partial: &mut [T]) {
+    sums(p, wanted, partial, |group, row, channel| {
+        let e = rgb[3 * row + channel] - wanted[4 * row + channel];
         normaliser(p, count[p.first_group as usize + group]) * if squares(p) { e * e } else { e.abs() }
     });
 }
 
-/// `d_rgb = scale · normaliser · sign(e)`, or `· 2e`.
-pub fn backward<T: Real>(p: ImageLossParams, rgb: &[T], target_rgb: &[T], count: &[T], d_rgb: &mut [T]) {
+/// `d_rgb = scale · normaliser · w · sign(e)`, or `· 2e`.
+pub fn backward<T: Real>(p: ImageLossParams, rgb: &[T], wanted: &[T], count: &[T], d_rgb: &mut [T]) {
     let values_per_group = 3 * p.rows_per_group as usize;
     for value in 0..p.groups as usize * values_per_group {
-        let e = rgb[value] - target_rgb[value];
+        let row = value / 3;
+        let e = rgb[value] - wanted[value + row];
         let d = if squares(p) {
             e + e
         } else if e == T::zero() {
@@ -51,6 +54,6 @@ pub fn backward<T: Real>(p: ImageLossParams, rgb: &[T], target_rgb: &[T], count:
             e.signum()
         };
         let image = p.first_group as usize + value / values_per_group;
-        d_rgb[value] = T::of_f32(p.scale) * normaliser(p, count[image]) * d;
+        d_rgb[value] = T::of_f32(p.scale) * normaliser(p, count[image]) * wanted[4 * row + 3] * d;
     }
 }

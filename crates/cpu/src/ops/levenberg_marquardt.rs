@@ -26,7 +26,7 @@ fn columns<T: Real>(m: &[T]) -> [[f64; 3]; 4] {
     [0, 1, 2, 3].map(|column| [0, 1, 2].map(|row| m[4 * row + column].wide()))
 }
 
-/// Per chunk of an image's rows: `A = Σ w J Jᵀ`, `g = Σ w e J`, `scale Σ ρ(e)`, of one channel.
+/// Per chunk of an image's rows: `A = Σ ω J Jᵀ`, `g = Σ ω e J`, `scale Σ w ρ(e)`, of one channel.
 pub fn equations<T: Real>(
     p: EquationsParams,
     world_from_camera: &[T],
@@ -35,7 +35,7 @@ pub fn equations<T: Real>(
     d_origin: &[T],
     d_direction: &[T],
     rgb: &[T],
-    target_rgb: &[T],
+    wanted: &[T],
     partial: &mut [T],
 ) {
     let [seed, scale, soft] = [p.seed, p.scale, p.soft].map(f64::from);
@@ -45,10 +45,11 @@ pub fn equations<T: Real>(
         let mut sums = [0.0; EQUATIONS];
         for row in chunk_of(chunk, p.chunk_rows, p.rows_per_group) {
             let at = 3 * (group * p.rows_per_group as usize + row);
-            let value = at + p.channel as usize;
-            let e = rgb[value].wide() - target_rgb[value].wide();
+            let pixel = at / 3 * 4;
+            let e = rgb[at + p.channel as usize].wide() - wanted[pixel + p.channel as usize].wide();
             let root = (e * e + soft * soft).sqrt();
-            let weight = scale / root;
+            let counts = scale * wanted[pixel + 3].wide();
+            let weight = counts / root;
 
             let [d_origin, d_direction] = [d_origin, d_direction].map(|values| three(&values[at..]).map(|d| d / seed));
             let (by_origin, by_direction) = (cross(three(&origin[at..]), d_origin), cross(three(&direction[at..]), d_direction));
@@ -62,7 +63,7 @@ pub fn equations<T: Real>(
                 }
                 sums[21 + a] += weight * e * j;
             }
-            sums[27] += scale * (e * e / (root + soft));
+            sums[27] += counts * (e * e / (root + soft));
         }
         for (partial, sum) in partial.iter_mut().zip(sums) {
             *partial = T::of(sum);

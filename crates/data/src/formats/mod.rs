@@ -257,7 +257,7 @@ impl<'a> Collector<'a> {
 }
 
 /// The mask of a picture in a folder of masks: `NAME.png` or, as COLMAP has it, `NAME.jpg.png`.
-fn mask_in(folder: &Path, image: &Path) -> Result<PathBuf> {
+pub fn mask_in(folder: &Path, image: &Path) -> Result<PathBuf> {
     let [stem, whole] =
         [image.file_stem(), image.file_name()].map(|name| name.unwrap_or_default().to_string_lossy().into_owned());
     let names = [format!("{stem}.png"), format!("{whole}.png"), format!("{stem}.jpg"), whole];

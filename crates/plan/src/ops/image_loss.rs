@@ -1,4 +1,4 @@
-//! Losses that are a sum over pixels: MAE, MSE, norm_l1, norm_l2 (spec 4).
+//! Losses that are a sum over pixels: MAE, MSE, norm_l1, norm_l2 (spec 4). `wanted [rows,4]` is a pixel's colour and how much it counts.
 
 use srn_shaders::{IMAGE_LOSS_BACKWARD, IMAGE_LOSS_COUNT, IMAGE_LOSS_FORWARD, ImageLossParams};
 
@@ -16,7 +16,7 @@ pub enum Kind {
     Mae = 0,
     /// Mean of `e²`.
     Mse = 1,
-    /// Sum of `|e|`, divided by one plus the number of target values that are not exactly 1.
+    /// Sum of `|e|`, divided by one plus the number of wanted values that are not exactly 1.
     NormL1 = 2,
     /// Sum of `e²`, divided likewise.
     NormL2 = 3,
@@ -27,17 +27,17 @@ pub fn partial_len(images: u32, pixels: u32) -> usize {
     size([images, pixels.div_ceil(CHUNK_ROWS)])
 }
 
-/// `count [images]`: target values that are not exactly 1. Once per target.
+/// `count [images]`: wanted values that are not exactly 1, by their weights. Once per target.
 pub fn count(
     b: &mut Builder,
     images: u32,
     pixels: u32,
-    target_rgb: BufferId,
+    wanted: BufferId,
     partial: BufferId,
     count: BufferId,
 ) -> Result<(), PlanError> {
     let params = params(Kind::Mae, whole(images, pixels), pixels, 0.0);
-    let args = [read(target_rgb, size([images, pixels, 3])), overwrite(partial, partial_len(images, pixels))];
+    let args = [read(wanted, size([images, pixels, 4])), overwrite(partial, partial_len(images, pixels))];
     b.step(&IMAGE_LOSS_COUNT, params, &args, [images * params.chunks, 1, 1], loops(), 0)?;
     sum::forward(b, sum::Groups::all(images), params.chunks, 1, partial, count, false)
 }
@@ -49,16 +49,15 @@ pub fn forward(
     images: u32,
     pixels: u32,
     rgb: BufferId,
-    target_rgb: BufferId,
+    wanted: BufferId,
     count: BufferId,
     partial: BufferId,
     loss: BufferId,
 ) -> Result<(), PlanError> {
     let params = params(kind, whole(images, pixels), pixels, 0.0);
-    let values = size([images, pixels, 3]);
     let args = [
-        read(rgb, values),
-        read(target_rgb, values),
+        read(rgb, size([images, pixels, 3])),
+        read(wanted, size([images, pixels, 4])),
         read(count, size([images])),
         overwrite(partial, partial_len(images, pixels)),
     ];
@@ -74,14 +73,14 @@ pub fn backward(
     pixels: u32,
     scale: f32,
     rgb: BufferId,
-    target_rgb: BufferId,
+    wanted: BufferId,
     count: BufferId,
     d_rgb: BufferId,
 ) -> Result<(), PlanError> {
     let values = size([rows.count(), 3]);
     let args = [
         read(rgb, values),
-        read(target_rgb, values),
+        read(wanted, size([rows.count(), 4])),
         read(count, size([rows.first_group + rows.groups])),
         overwrite(d_rgb, values),
     ];

@@ -28,8 +28,8 @@ pub struct Residuals {
     pub d_direction: BufferId,
     /// Colours `[rows,3]`.
     pub rgb: BufferId,
-    /// Colours wanted `[rows,3]`.
-    pub target_rgb: BufferId,
+    /// Colours wanted, and how much a pixel counts `[rows,4]`.
+    pub wanted: BufferId,
 }
 
 /// How residuals of a channel count.
@@ -66,7 +66,7 @@ pub fn equations(
     let Channel { number: channel, seed, scale, soft } = channel;
     let params =
         EquationsParams { groups, rows_per_group, first_group, chunk_rows: CHUNK_ROWS, chunks, channel, seed, scale, soft };
-    let Residuals { world_from_camera, origin, direction, d_origin, d_direction, rgb, target_rgb } = residuals;
+    let Residuals { world_from_camera, origin, direction, d_origin, d_direction, rgb, wanted } = residuals;
     let args = [
         read(world_from_camera, size([first_group + groups, 12])),
         read(origin, n),
@@ -74,7 +74,7 @@ pub fn equations(
         read(d_origin, n),
         read(d_direction, n),
         read(rgb, n),
-        read(target_rgb, n),
+        read(wanted, size([rows.count(), 4])),
         overwrite(partial, partial_len(rows)),
     ];
     let loops = u64::from(CHUNK_ROWS) * (1 + 6 + 21) + u64::from(EQUATIONS);

@@ -1,0 +1,204 @@
+//! A photograph as a search for its pose takes it: a square, the object in it, and how much each pixel counts.
+
+use crate::error::{Error, Result};
+use crate::picture::read_mask;
+use crate::pixels::Pixels;
+use crate::srn::{Intrinsics, load_square};
+use std::path::Path;
+
+/// Room around the object on each side of a square that is cut around it, as a share of its extent.
+pub const MARGIN: f64 = 0.1;
+
+/// A square of a picture, resampled.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Target {
+    /// Colours in [-1, 1], row-major `[side · side, 3]`; white where the picture is transparent.
+    pub rgb: Vec<f32>,
+    /// How much each pixel counts, 0 to 1, `[side · side]`; `None` where all do.
+    pub weights: Option<Vec<f32>>,
+    /// `fx, fy, cx, cy` in pixels of the square; integer coordinates are pixel centres.
+    pub intrinsics: [f32; 4],
+    /// The first pixel of the square in the picture, across and down; outside of it where the square reaches out.
+    pub corner: [i64; 2],
+    /// Width and height of the square in pixels of the picture.
+    pub extent: usize,
+}
+
+impl Target {
+    /// Reads a picture that was cut before, as those of data sets are: its centre square (see [`load_square`]). Where the mask is
+    /// black, pixels do not count.
+    pub fn of_view(path: &Path, mask: Option<&Path>, intrinsics: &Intrinsics, side: usize) -> Result<Self> {
+        let size = crate::srn::picture_size(path)?;
+        let extent = size[0].min(size[1]);
+        let corner = size.map(|s| ((s - extent) / 2) as i64);
+        let Some(mask) = mask else {
+            let (pixels, intrinsics) = load_square(path, intrinsics, side)?;
+            return Ok(Self { rgb: pixels.data, weights: None, intrinsics, corner, extent });
+        };
+        let (picture, counts) = (Pixels::open(path)?, counts(mask, size)?);
+        let Intrinsics { focal: [fx, fy], centre: [cx, cy], .. } = intrinsics.of_picture(path, size)?.of_square(side);
+        let (rgb, weights) = weighted(&picture, &counts, corner, extent, side);
+        Ok(Self { rgb, weights: Some(weights), intrinsics: [fx, fy, cx, cy].map(|x| x as f32), corner, extent })
+    }
+
+    /// Reads a photograph and cuts a square around what mask and transparency leave of it, with [`MARGIN`]; the intrinsics follow.
+    /// Pixels where the mask is black, or outside of the photograph, do not count; transparent ones are white background, and do.
+    /// Without mask and transparency it is the centre square.
+    pub fn of_photo(path: &Path, mask: Option<&Path>, intrinsics: &Intrinsics, side: usize) -> Result<Self> {
+        let (picture, opacity) = Pixels::open_with_opacity(path)?;
+        let size = [picture.width, picture.height];
+        let counts = mask.map(|mask| counts(mask, size)).transpose()?;
+        let inside = |i: usize| opacity[i] > 0.5 && counts.as_ref().is_none_or(|counts| counts[i] > 0.5);
+        let points = (0..opacity.len()).filter(|&i| inside(i)).map(|i| [i % size[0], i / size[0]]);
+        let bounds = points.clone().fold(None, |bounds: Option<[[usize; 2]; 2]>, p| {
+            let [low, high] = bounds.unwrap_or([p; 2]);
+            Some([[0, 1].map(|k| low[k].min(p[k])), [0, 1].map(|k| high[k].max(p[k]))])
+        });
+        let Some([low, high]) = bounds else {
+            return Err(Error::field(mask.unwrap_or(path), "mask", "white, or opaque, where the object is", "nothing of it"));
+        };
+        if points.count() == opacity.len() {
+            return Self::of_view(path, None, intrinsics, side);
+        }
+        let across = [0, 1].map(|k| high[k] - low[k] + 1);
+        let extent = (across[0].max(across[1]) as f64 * (1.0 + 2.0 * MARGIN)).ceil() as usize;
+        let corner = [0, 1].map(|k| (low[k] + high[k] + 1) as i64 / 2 - extent as i64 / 2);
+        let intrinsics = intrinsics.of_picture(path, size)?;
+        let scale = side as f64 / extent as f64;
+        let [fx, fy] = intrinsics.focal.map(|focal| focal * scale);
+        // Edges of pixels are whole numbers half a pixel before the centres.
+        let [cx, cy] = [0, 1].map(|k| (intrinsics.centre[k] + 0.5 - corner[k] as f64) * scale - 0.5);
+        let intrinsics = [fx, fy, cx, cy].map(|x| x as f32);
+        let (rgb, weights) = match counts {
+            Some(counts) => {
+                let (rgb, weights) = weighted(&picture, &counts, corner, extent, side);
+                (rgb, Some(weights))
+            }
+            None => (picture.square(corner, extent, 1.0).area_resample(side, side).data, None),
+        };
+        Ok(Self { rgb, weights, intrinsics, corner, extent })
+    }
+}
+
+/// A mask as numbers from 0 to 1.
+fn counts(mask: &Path, size: [usize; 2]) -> Result<Vec<f32>> {
+    Ok(read_mask(mask, size.map(|s| s as u32))?.into_iter().map(|m| f32::from(m) / 255.0).collect())
+}
+
+/// Colours and weights of a square: a pixel's weight is the share of its area that counts, its colour the mean of that share, so
+/// that nothing of what is masked out bleeds in.
+fn weighted(picture: &Pixels, counts: &[f32], corner: [i64; 2], extent: usize, side: usize) -> (Vec<f32>, Vec<f32>) {
+    let square = |data: Vec<f32>| Pixels { data, ..*picture }.square(corner, extent, 0.0).area_resample(side, side);
+    let weights = square(counts.iter().flat_map(|&w| [w; 3]).collect()).data;
+    let times = |(colour, weight): (&[f32], &f32)| [0, 1, 2].map(|c| colour[c] * weight);
+    let colours = square(picture.data.chunks_exact(3).zip(counts).flat_map(times).collect()).data;
+    let mean = |(sum, weight): (f32, &f32)| if *weight > 0.0 { (sum / weight).clamp(-1.0, 1.0) } else { 1.0 };
+    let rgb = colours.into_iter().zip(&weights).map(mean).collect();
+    (rgb, weights.into_iter().step_by(3).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::{GrayImage, Luma, Rgb, RgbImage, Rgba, RgbaImage};
+
+    const INTRINSICS: Intrinsics = Intrinsics { focal: [60.0, 60.0], centre: [30.0, 20.0], size: [60, 40] };
+
+    /// A blue rectangle, 41 ≤ x < 51 and 6 ≤ y < 12, on red; the right half of it is green.
+    fn colour(x: u32, y: u32) -> [u8; 3] {
+        match (x, y) {
+            (41..46, 6..12) => [0, 0, 255],
+            (46..51, 6..12) => [0, 255, 0],
+            _ => [255, 0, 0],
+        }
+    }
+
+    fn saved(dir: &Path, name: &str, picture: impl Into<image::DynamicImage>) -> std::path::PathBuf {
+        let path = dir.join(name);
+        picture.into().save(&path).unwrap();
+        path
+    }
+
+    #[test]
+    fn a_photograph_is_cut_around_what_counts() {
+        let dir = tempfile::tempdir().unwrap();
+        let photo = saved(dir.path(), "photo.png", RgbImage::from_fn(60, 40, |x, y| Rgb(colour(x, y))));
+        let object = |x: u32, y: u32| (41..51).contains(&x) && (6..12).contains(&y);
+        let mask = GrayImage::from_fn(60, 40, |x, y| Luma([if object(x, y) { 255 } else { 0 }]));
+        let mask = saved(dir.path(), "mask.png", mask);
+        let target = Target::of_photo(&photo, Some(&mask), &INTRINSICS, 6).unwrap();
+        // 10 pixels and a tenth on each side: 12, two for each of the square's; rows 3 to 14.
+        assert_eq!((target.corner, target.extent), ([40, 3], 12));
+        let weights = target.weights.unwrap();
+        let row = |y: usize| &weights[6 * y..][..6];
+        assert_eq!(row(0), [0.0; 6]);
+        assert_eq!((row(2), row(1)), (&[0.5, 1.0, 1.0, 1.0, 1.0, 0.5][..], &[0.25, 0.5, 0.5, 0.5, 0.5, 0.25][..]));
+        let pixel = |x: usize, y: usize| &target.rgb[3 * (6 * y + x)..][..3];
+        // No red comes in from around the object.
+        assert_eq!((pixel(0, 2), pixel(5, 2)), (&[-1.0, -1.0, 1.0][..], &[-1.0, 1.0, -1.0][..]));
+        assert_eq!(pixel(0, 0), [1.0; 3]);
+        // Where the photograph has the pixel (43.5, 8.5), the square has (1.5, 2.5) - half a pixel of its own: the same ray.
+        let [fx, fy, cx, cy] = target.intrinsics;
+        let ray = [(1.5 - cx) / fx, (2.5 - cy) / fy];
+        assert!((ray[0] - (43.5 - 30.0) / 60.0).abs() < 1e-6 && (ray[1] - (8.5 - 20.0) / 60.0).abs() < 1e-6, "{ray:?}");
+
+        // Transparency is white background that counts, and cuts as well; the mask takes away from it.
+        let cut = RgbaImage::from_fn(60, 40, |x, y| {
+            let [r, g, b] = colour(x, y);
+            Rgba([r, g, b, if object(x, y) { 255 } else { 0 }])
+        });
+        let cut = saved(dir.path(), "cut.png", cut);
+        let alone = Target::of_photo(&cut, None, &INTRINSICS, 6).unwrap();
+        assert_eq!((alone.corner, alone.extent, alone.weights.is_none()), ([40, 3], 12, true));
+        assert_eq!((&alone.rgb[..3], &alone.rgb[3 * 13..][..3]), (&[1.0; 3][..], &[-1.0, -1.0, 1.0][..]));
+        let left = GrayImage::from_fn(60, 40, |x, _| Luma([if x < 46 { 255 } else { 0 }]));
+        let left = saved(dir.path(), "left.png", left);
+        let both = Target::of_photo(&cut, Some(&left), &INTRINSICS, 6).unwrap();
+        assert_eq!((both.corner, both.extent), ([39, 5], 8));
+        assert_eq!((both.weights.as_ref().unwrap()[0], both.weights.as_ref().unwrap()[5]), (1.0, 0.0));
+    }
+
+    #[test]
+    fn a_square_may_reach_out_of_the_photograph() {
+        let dir = tempfile::tempdir().unwrap();
+        let photo = saved(dir.path(), "photo.png", RgbImage::from_pixel(60, 40, Rgb([255, 0, 0])));
+        let mask = saved(dir.path(), "mask.png", GrayImage::from_fn(60, 40, |x, _| Luma([if x < 20 { 255 } else { 0 }])));
+        let target = Target::of_photo(&photo, Some(&mask), &INTRINSICS, 12).unwrap();
+        assert_eq!((target.corner, target.extent), ([-14, -4], 48));
+        let weights = target.weights.unwrap();
+        // Of the square's row, 14 pixels lie outside, 20 in the mask: 3.5 and 5 of its own.
+        assert_eq!(weights[6 * 12..7 * 12], [0.0, 0.0, 0.0, 0.5, 1.0, 1.0, 1.0, 1.0, 0.5, 0.0, 0.0, 0.0]);
+        assert_eq!(weights[..12], [0.0; 12]);
+    }
+
+    #[test]
+    fn views_stay_as_they_were_cut() {
+        let dir = tempfile::tempdir().unwrap();
+        let picture = RgbImage::from_fn(60, 40, |x, y| Rgb(colour(x, y)));
+        let path = saved(dir.path(), "view.png", picture);
+        let (pixels, intrinsics) = load_square(&path, &INTRINSICS, 8).unwrap();
+        let plain = Target::of_view(&path, None, &INTRINSICS, 8).unwrap();
+        assert_eq!((&plain.rgb, plain.intrinsics, plain.weights), (&pixels.data, intrinsics, None));
+        assert_eq!((plain.corner, plain.extent), ([10, 0], 40));
+        assert_eq!(Target::of_photo(&path, None, &INTRINSICS, 8).unwrap().rgb, pixels.data);
+        let top = saved(dir.path(), "top.png", GrayImage::from_fn(60, 40, |_, y| Luma([if y < 20 { 255 } else { 0 }])));
+        let masked = Target::of_view(&path, Some(&top), &INTRINSICS, 8).unwrap();
+        assert_eq!(masked.intrinsics, intrinsics);
+        assert_eq!(masked.weights.unwrap(), [[1.0; 32], [0.0; 32]].concat());
+        assert!(masked.rgb[..96].iter().zip(&pixels.data).all(|(a, b)| (a - b).abs() < 1e-6));
+        assert_eq!(masked.rgb[96..], [1.0; 96]);
+    }
+
+    #[test]
+    fn masks_that_do_not_fit_are_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let photo = saved(dir.path(), "photo.png", RgbImage::new(60, 40));
+        let small = saved(dir.path(), "small.png", GrayImage::new(6, 4));
+        let black = saved(dir.path(), "black.png", GrayImage::new(60, 40));
+        let error = |mask: &Path| Target::of_photo(&photo, Some(mask), &INTRINSICS, 6).unwrap_err().to_string();
+        let (wrong, nothing) = (error(&small), error(&black));
+        assert!(wrong.contains("small.png") && wrong.contains("60×40") && wrong.contains("6×4"), "{wrong}");
+        assert!(nothing.contains("black.png") && nothing.contains("nothing"), "{nothing}");
+        assert!(error(&dir.path().join("nowhere.png")).contains("nowhere.png"));
+    }
+}
