@@ -1,4 +1,4 @@
-// d_rgb = scale normaliser w sign(e) (MAE, norm_l1) or scale normaliser w 2e (MSE, norm_l2), e = rgb - wanted, sign(0) = 0.
+// d_rgb = scale normaliser w ρ'(e), e = rgb - wanted; ρ': sign(e) (MAE, norm_l1; sign(0) = 0), 2e (MSE, norm_l2), e / √(e² + s²) (Charbonnier).
 // One invocation computes one value.
 // rgb [groups · rows_per_group, 3], wanted [groups · rows_per_group, 4] = (r, g, b, w), count [images] (norm_l1, norm_l2) → d_rgb as rgb.
 // OVERWRITES d_rgb.
@@ -12,6 +12,7 @@ struct Params {
     chunk_rows: u32,
     chunks: u32,
     scale: f32,
+    soft: f32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -40,6 +41,9 @@ fn main(
     }
     let row = i / 3u;
     let e = rgb[i] - wanted[i + row];
-    let slope = select(sign(e), 2.0 * e, params.kind == MSE || params.kind == NORM_L2);
+    var slope = select(sign(e), 2.0 * e, params.kind == MSE || params.kind == NORM_L2);
+    if (params.kind == CHARBONNIER) {
+        slope = e / sqrt(e * e + params.soft * params.soft);
+    }
     d_rgb[i] = params.scale * normaliser(params.first_group + i / values_per_group) * wanted[4u * row + 3u] * slope;
 }

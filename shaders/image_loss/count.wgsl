@@ -12,6 +12,7 @@ struct Params {
     chunk_rows: u32,
     chunks: u32,
     scale: f32,
+    soft: f32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;

@@ -1,4 +1,4 @@
-// partial[g, c] = normaliser Σ w |e| (MAE, norm_l1) or Σ w e² (MSE, norm_l2) over the rows of chunk c, e = rgb - wanted.
+// partial[g, c] = normaliser Σ w ρ(e) over the rows of chunk c, e = rgb - wanted; ρ: |e| (MAE, norm_l1), e² (MSE, norm_l2), √(e² + s²) - s (Charbonnier).
 // One invocation sums one chunk of one image.
 // rgb [groups · rows_per_group, 3], wanted [groups · rows_per_group, 4] = (r, g, b, w), count [images] (norm_l1, norm_l2) → partial [groups, chunks].
 // OVERWRITES partial.
@@ -12,6 +12,7 @@ struct Params {
     chunk_rows: u32,
     chunks: u32,
     scale: f32,
+    soft: f32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -46,7 +47,12 @@ fn main(
     for (var row = image + first; row < image + end; row++) {
         for (var c = 0u; c < 3u; c++) {
             let e = rgb[3u * row + c] - wanted[4u * row + c];
-            total += wanted[4u * row + 3u] * select(abs(e), e * e, squared);
+            var rho = select(abs(e), e * e, squared);
+            if (params.kind == CHARBONNIER) {
+                // The same as the root less s, without the cancellation.
+                rho = e * e / (sqrt(e * e + params.soft * params.soft) + params.soft);
+            }
+            total += wanted[4u * row + 3u] * rho;
         }
     }
     partial[index] = normaliser(params.first_group + group) * total;

@@ -110,4 +110,6 @@ pub const COMMON: &str = concat!(
     include_str!("../common/image_loss.wgsl"),
     "\n",
     include_str!("../common/gmsd.wgsl"),
+    "\n",
+    include_str!("../common/bfgs.wgsl"),
 );

@@ -56,7 +56,7 @@ macro_rules! params {
 }
 
 params! {
-    /// `pose/*`, `levenberg_marquardt/accept` and `/solve`: number of poses.
+    /// `pose/*`, `bfgs/*` but for `equations`: number of poses.
     PoseParams {
         /// Number of poses.
         poses: u32,
@@ -165,7 +165,7 @@ params! {
     }
     /// `image_loss/*`.
     ImageLossParams {
-        /// 0 MAE, 1 MSE, 2 norm_l1, 3 norm_l2.
+        /// 0 MAE, 1 MSE, 2 norm_l1, 3 norm_l2, 4 Charbonnier.
         kind: u32,
         /// Images.
         groups: u32,
@@ -173,7 +173,7 @@ params! {
         rows_per_group: u32,
         /// Number of the first image.
         first_group: u32,
-        /// Values of a whole image (3 × pixels), the divisor of MAE and MSE.
+        /// Values of a whole image (3 × pixels), the divisor of MAE, MSE and Charbonnier.
         values_per_image: u32,
         /// Rows per partial sum.
         chunk_rows: u32,
@@ -181,6 +181,8 @@ params! {
         chunks: u32,
         /// Factor on the gradient.
         scale: f32,
+        /// Residual at which Charbonnier turns from squares to absolute values.
+        soft: f32,
     }
     /// `gmsd/*`.
     GmsdParams {
@@ -225,7 +227,7 @@ params! {
         /// 1: add to the output, 0: overwrite it.
         accumulate: u32,
     }
-    /// `levenberg_marquardt/equations`: rows of a tile, and the residual of one channel.
+    /// `bfgs/equations`: rows of a tile, and the residual of one channel.
     EquationsParams {
         /// Images in this tile.
         groups: u32,
@@ -241,7 +243,7 @@ params! {
         channel: u32,
         /// What the backward pass began with: gradients are those of `seed · rgb[channel]`.
         seed: f32,
-        /// Factor on weights and loss.
+        /// Factor on the weights.
         scale: f32,
         /// Residual at which the loss turns from squares to absolute values.
         soft: f32,

@@ -155,12 +155,12 @@ table! {
     /// Extent: groups · chunks.
     IMAGE_LOSS_COUNT = "image_loss"/"count", ImageLossParams, tile FLAT,
         (wanted: f32) -> (partial: f32);
-    /// Sum of `w |e|` or `w e²` over the rows of a chunk, times the normaliser: `1 / values_per_image` (MAE, MSE) or
+    /// Sum of `w ρ(e)` over the rows of a chunk, times the normaliser: `1 / values_per_image` (MAE, MSE, Charbonnier) or
     /// `1 / (1 + count[image])` (norm_l1, norm_l2), `image = first_group + group`. `rgb [groups · rows_per_group, 3]`
-    /// and `wanted [groups · rows_per_group, 4]` of the tile, `count [images]` of the whole batch (not read for MAE and MSE) → `partial [groups, chunks]`. Extent: groups · chunks.
+    /// and `wanted [groups · rows_per_group, 4]` of the tile, `count [images]` of the whole batch (read for those two) → `partial [groups, chunks]`. Extent: groups · chunks.
     IMAGE_LOSS_FORWARD = "image_loss"/"forward", ImageLossParams, tile FLAT,
         (rgb: f32, wanted: f32, count: f32) -> (partial: f32);
-    /// `d_rgb = scale · normaliser · w · sign(e)` or `· 2e`; `sign(0) = 0`. Extent: values.
+    /// `d_rgb = scale · normaliser · w · ρ'(e)`; `sign(0) = 0`. Extent: values.
     IMAGE_LOSS_BACKWARD = "image_loss"/"backward", ImageLossParams, tile FLAT,
         (rgb: f32, wanted: f32, count: f32) -> (d_rgb: f32);
     /// To `[0,1]` (not clamped), YIQ luma `0.299 R + 0.587 G + 0.114 B`, 2×2 average: `rgb [images, height, width, 3]` → `luma [images, h2, w2]`,
@@ -192,16 +192,22 @@ table! {
     SUM_FORWARD = "sum"/"forward", SumParams, tile FLAT,
         (x: f32) -> (y: f32);
     /// Normal equations of one channel's residuals over a motion `ξ` about the object, in the camera's axes: per chunk of an image's
-    /// rows the upper triangle of `A = Σ ω J Jᵀ` (21 values), `g = Σ ω e J` (6) and the loss `scale Σ w ρ(e)` (1), `ρ = √(e² + s²) - s`, `ω = scale w / √(e² + s²)`.
-    /// `origin, direction, d_origin, d_direction, rgb [rows,3]`, `wanted [rows,4]` (colour, weight `w`) → `partial [groups, chunks, 28]`.
-    LEVENBERG_MARQUARDT_EQUATIONS = "levenberg_marquardt"/"equations", EquationsParams, tile FLAT,
+    /// rows the upper triangle of `A = Σ ω J Jᵀ` (21 values) and `g = Σ ω e J` (6), `ω = scale w / √(e² + s²)`.
+    /// `origin, direction, d_origin, d_direction, rgb [rows,3]`, `wanted [rows,4]` (colour, weight `w`) → `partial [groups, chunks, 27]`.
+    BFGS_EQUATIONS = "bfgs"/"equations", EquationsParams, tile FLAT,
         (world_from_camera: f32, origin: f32, direction: f32, d_origin: f32, d_direction: f32, rgb: f32, wanted: f32) -> (partial: f32);
-    /// Where the trial's loss is lower, keeps its equations and pose, and damps less; elsewhere damps more. Extent: poses.
-    LEVENBERG_MARQUARDT_ACCEPT = "levenberg_marquardt"/"accept", PoseParams, tile FLAT,
-        (equations: f32, world_from_camera: f32) -> (best_equations: f32, best_pose: f32, damping: f32);
-    /// The next trial: `(A + damping diag A) ξ = -g`, `|ξ| ≤ 0.5`, `pose` moved by `ξ`. Extent: poses.
-    LEVENBERG_MARQUARDT_SOLVE = "levenberg_marquardt"/"solve", PoseParams, tile FLAT,
-        (equations: f32, pose: f32, damping: f32) -> (world_from_camera: f32);
+    /// The search's `state [poses,47]` at its first pose, its second derivatives from the normal equations `[poses,27]`. Extent: poses.
+    BFGS_BEGIN = "bfgs"/"begin", PoseParams, tile FLAT,
+        (equations: f32, loss: f32, world_from_camera: f32) -> (state: f32);
+    /// Gradient over `ξ` `[poses,6]` from that over the pose's matrix. Extent: poses.
+    BFGS_GRADIENT = "bfgs"/"gradient", PoseParams, tile FLAT,
+        (world_from_camera: f32, d_world_from_camera: f32) -> (gradient: f32);
+    /// What a trial says: second derivatives from the change of the gradient, the best pose, how long steps may be. Extent: poses.
+    BFGS_UPDATE = "bfgs"/"update", PoseParams, tile FLAT,
+        (gradient: f32, loss: f32, world_from_camera: f32) -> (state: f32);
+    /// The next trial: `B ξ = -g`, shortened to the radius, the best pose moved by `ξ`. Extent: poses.
+    BFGS_SOLVE = "bfgs"/"solve", PoseParams, tile FLAT,
+        () -> (world_from_camera: f32, state: f32);
     /// RGB in `[-1,1]` to packed RGBA8 (r in the low byte, alpha 255), clamped and rounded: `rgb [.., 3]` → `packed [height, stride]`. Extent: width · height.
     PACK_RGBA8_FORWARD = "pack_rgba8"/"forward", PackParams, tile FLAT,
         (rgb: f32) -> (packed: u32);

@@ -103,7 +103,7 @@ fn run() -> Result<()> {
             let before = rows.len();
             rows.push(row);
             if width == 64 {
-                rows.push(bench.pose_step(Method::LevenbergMarquardt { soft: 0.3 }, BATCH, SIDE)?.0);
+                rows.push(bench.pose_step(Method::Bfgs { soft: 0.3 }, BATCH, SIDE)?.0);
             }
             // Long, and of two budgets.
             bench.runs = 1;
@@ -210,7 +210,7 @@ impl Bench<'_> {
             descent.losses()?;
             Ok(())
         })?;
-        let name = if matches!(method, Method::Adam { .. }) { "Adam" } else { "Levenberg–Marquardt" };
+        let name = if matches!(method, Method::Adam { .. }) { "Adam" } else { "BFGS" };
         let what = format!("pose step, {name}, {hypotheses} hypotheses");
         Ok((self.row(what, time, descent.flops_per_step(), descent.bytes()), descent))
     }

@@ -28,6 +28,8 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward", "|| params.kind == NORM_L2) {", "|| params.kind == MAE) {"),
         ("forward", "group * params.rows_per_group;", "params.rows_per_group;"),
         ("forward", "wanted[4u * row + 3u] *", ""),
+        ("forward", "+ params.soft)", ")"),
+        ("forward", "params.kind == CHARBONNIER", "false"),
         ("forward", "first + params.chunk_rows", "params.chunk_rows"),
     ],
 };
@@ -43,6 +45,7 @@ pub static BACKWARD: KernelTest = KernelTest {
         ("backward", "2.0 * e", "e"),
         ("backward", "wanted[4u * row + 3u] *", ""),
         ("backward", "wanted[i + row]", "wanted[i]"),
+        ("backward", "e / sqrt", "e * sqrt"),
         ("backward", "f32(params.values_per_image)", "f32(params.rows_per_group)"),
     ],
 };
@@ -62,7 +65,7 @@ fn backward_matches_reference() {
     BACKWARD.matches_reference();
 }
 
-const KINDS: [Kind; 4] = [Kind::Mae, Kind::Mse, Kind::NormL1, Kind::NormL2];
+const KINDS: [Kind; 5] = [Kind::Mae, Kind::Mse, Kind::NormL1, Kind::NormL2, Kind::Charbonnier { soft: 0.2 }];
 
 /// Render `[rows,3]`, and what is wanted `[rows,4]`: every fifth value is white, every seventh is met exactly; some rows count less,
 /// some not at all.

@@ -10,6 +10,7 @@ use srn_tests::{Case, Divergence, gpu, lockstep};
 
 mod adam;
 mod advance;
+mod bfgs;
 mod density_sum;
 mod depth;
 mod depth_loss;
@@ -19,7 +20,6 @@ mod gmsd;
 mod image_loss;
 mod latent_loss;
 mod layer_norm_relu;
-mod levenberg_marquardt;
 mod linear;
 mod lockstep;
 mod lstm_cell;
@@ -81,9 +81,11 @@ static ALL: &[&KernelTest] = &[
     &gmsd::BACKWARD_POOL,
     &adam::STEP,
     &sum::FORWARD,
-    &levenberg_marquardt::EQUATIONS,
-    &levenberg_marquardt::ACCEPT,
-    &levenberg_marquardt::SOLVE,
+    &bfgs::EQUATIONS,
+    &bfgs::BEGIN,
+    &bfgs::GRADIENT,
+    &bfgs::UPDATE,
+    &bfgs::SOLVE,
     &pack_rgba8::FORWARD,
 ];
 

@@ -100,7 +100,7 @@ fn a_pose_near_the_truth_comes_nearer() {
         let rendering = Renderer::new(&engine, model, 3, SIDE, SIDE).unwrap().render(&[0, 1, 1], &cameras, 0).unwrap();
 
         let shape = Shape { hypotheses: 3, width: SIDE, height: SIDE, instances: 2 };
-        let mut descent = Descent::new(&engine, model, shape, Method::LevenbergMarquardt { soft: 1.0 }).unwrap();
+        let mut descent = Descent::new(&engine, model, shape, Method::Bfgs { soft: 1.0 }).unwrap();
         let mut rays = Rays::default();
         let mut random = stream(0, 0);
         truths.iter().for_each(|truth| rays.push(truth, &intrinsics(), pixel_grid(SIDE, SIDE, 1), &mut random));
@@ -144,7 +144,7 @@ fn what_does_not_count_has_no_influence() {
         starts: camera::neighbor4(&truth),
     };
     let adam = |loss| Method::Adam { loss, learning_rate: 0.01 };
-    let methods = [Loss::Mae, Loss::NormL2].map(adam).into_iter().chain([Method::LevenbergMarquardt { soft: 0.3 }]);
+    let methods = [Loss::Mae, Loss::NormL2].map(adam).into_iter().chain([Method::Bfgs { soft: 0.3 }]);
     for method in methods {
         let phases = [(2, 4), (1, 2)].map(|(stride, keep)| Phase { steps: 3, stride, keep }).into();
         let options = Options { method, phases, seed: 0 };

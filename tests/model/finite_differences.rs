@@ -106,12 +106,8 @@ fn of_every_number_of_a_pose_in_every_method() {
                 }
                 descent.set_poses(&poses).unwrap();
                 descent.evaluate().unwrap();
-                // The loss is the last of Levenberg–Marquardt's 28 values per pose.
-                let name = if matches!(method, Method::Adam { .. }) { "loss" } else { "equations" };
-                let losses = buffer(descent.executor(), name);
-                let values = descent.executor().read_f64(losses).unwrap();
-                let each = values.len() / HYPOTHESES as usize;
-                values.chunks(each).map(|values| values[each - 1]).collect::<Vec<f64>>()
+                let losses = buffer(descent.executor(), "loss");
+                descent.executor().read_f64(losses).unwrap()
             };
             let (ahead, behind) = (losses_at(STEP), losses_at(-STEP));
             for (k, gradient) in gradients.iter().enumerate() {

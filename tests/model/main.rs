@@ -55,10 +55,10 @@ fn trainer(engine: &Engine, model: Model, train: Train, images: u32) -> Trainer 
     Trainer::new(engine, model, train, images, RAYS).unwrap()
 }
 
-/// Every way to move: the paper's with every loss, and Levenberg–Marquardt.
+/// Every way to move: the paper's with every loss, and BFGS.
 fn methods() -> Vec<Method> {
     let adam = |loss| Method::Adam { loss, learning_rate: 0.01 };
-    LOSSES.into_iter().map(adam).chain([Method::LevenbergMarquardt { soft: 0.3 }]).collect()
+    LOSSES.into_iter().map(adam).chain([Method::Bfgs { soft: 0.3 }]).collect()
 }
 
 /// Rays that count more, less, and not at all; GMSD counts all.

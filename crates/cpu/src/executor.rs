@@ -217,8 +217,10 @@ references! {
     "gmsd/backward_pool" => gmsd::backward_pool(f) -> (f_mut);
     "adam/step" => adam::step(f f) -> (f_mut f_mut f_mut);
     "sum/forward" => sum::forward(f) -> (f_mut);
-    "levenberg_marquardt/equations" => levenberg_marquardt::equations(f f f f f f f) -> (f_mut);
-    "levenberg_marquardt/accept" => levenberg_marquardt::accept(f f) -> (f_mut f_mut f_mut);
-    "levenberg_marquardt/solve" => levenberg_marquardt::solve(f f f) -> (f_mut);
+    "bfgs/equations" => bfgs::equations(f f f f f f f) -> (f_mut);
+    "bfgs/begin" => bfgs::begin(f f f) -> (f_mut);
+    "bfgs/gradient" => bfgs::gradient(f f) -> (f_mut);
+    "bfgs/update" => bfgs::update(f f f) -> (f_mut);
+    "bfgs/solve" => bfgs::solve() -> (f_mut f_mut);
     "pack_rgba8/forward" => pack_rgba8::forward(f) -> (u_mut);
 }

@@ -1,7 +1,9 @@
 //! One step of pose estimation for many hypotheses at once: render, compare, move. Two ways to move: the paper's (spec 4), Adam
-//! on the camera's six numbers; and Levenberg–Marquardt on the residuals of all rays, over motions about the object.
+//! on the camera's six numbers; and BFGS over motions about the object, begun from the residuals of all rays.
 
-use srn_plan::ops::levenberg_marquardt::{self as lm, Channel, Residuals};
+use std::iter::zip;
+
+use srn_plan::ops::bfgs::{self, Channel, Residuals};
 use srn_plan::ops::{adam, gmsd, image_loss, pose, rays, tile as tile_ops};
 use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, Tile, tiles};
 
@@ -51,16 +53,15 @@ pub enum Method {
         /// Step size, the same in each step.
         learning_rate: f64,
     },
-    /// Levenberg–Marquardt on the residuals of all rays and channels. A step turns and shifts the camera about the object (the
-    /// world origin) and is kept where the loss falls, the mean over all values of `ρ(e) = √(e² + soft²) - soft`.
-    LevenbergMarquardt {
+    /// Broyden, Fletcher, Goldfarb, Shanno. A step turns and shifts the camera about the object (the world origin) and is kept where
+    /// the loss falls, the mean over all values of `ρ(e) = √(e² + soft²) - soft`. Second derivatives are at first those of least
+    /// squares, from the residuals of all rays and channels; each step then corrects them by the change of the gradient.
+    Bfgs {
         /// Residual (colours span 2) at which `ρ` turns from squares to absolute values.
         soft: f32,
     },
 }
 
-/// Damping before the first evaluation, which is always the best so far.
-const FIRST_DAMPING: f32 = 0.03;
 /// What the backward pass of a channel begins with: small, since gradients in the marcher are clamped to ±10 (spec 2), which is
 /// meant for those of a mean over an image. A power of two, so that nothing is rounded.
 const SEED: f32 = 1.0 / 4096.0;
@@ -84,31 +85,20 @@ struct Handles {
     target: BufferId,
     gmsd: bool,
     instances: StageId,
-    /// What follows from the targets alone, with the losses that have such a thing.
-    targets: Option<StageId>,
+    /// What follows from the targets alone.
+    targets: StageId,
+    compare: StageId,
     evaluate: StageId,
     descend: StageId,
+    loss: BufferId,
     moves: Moves,
 }
 
 /// Buffers of the poses, by method.
 #[derive(Clone, Copy)]
 enum Moves {
-    Adam {
-        learning_rate: f64,
-        pose6: BufferId,
-        d_pose6: BufferId,
-        loss: BufferId,
-        schedule: BufferId,
-        moments: [BufferId; 2],
-    },
-    LevenbergMarquardt {
-        equations: BufferId,
-        best_equations: BufferId,
-        best_pose: BufferId,
-        damping: BufferId,
-        seeds: [BufferId; 3],
-    },
+    Adam { learning_rate: f64, pose6: BufferId, d_pose6: BufferId, schedule: BufferId, moments: [BufferId; 2] },
+    Bfgs { begin: StageId, equations: BufferId, gradient: BufferId, state: BufferId, seeds: [BufferId; 3] },
 }
 
 /// The descent of many hypotheses, the network frozen.
@@ -117,6 +107,8 @@ pub struct Descent {
     handles: Handles,
     shape: Shape,
     steps: u64,
+    /// Whether gradients were evaluated since the poses were set.
+    begun: bool,
 }
 
 impl Descent {
@@ -137,14 +129,14 @@ impl Descent {
             engine.fit(rows, model.layout.features(), |b, tile_rows| build(b, model, shape, method, tile_rows))?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, model)?;
-        if let Moves::LevenbergMarquardt { seeds, .. } = handles.moves {
+        if let Moves::Bfgs { seeds, .. } = handles.moves {
             for (channel, seed) in seeds.into_iter().enumerate() {
                 let len = runner.plan().buffer(seed).len;
                 let values: Vec<f32> = (0..len).map(|k| if k % 3 == channel { SEED } else { 0.0 }).collect();
                 runner.write(seed, &values)?;
             }
         }
-        Ok(Descent { runner, handles, shape, steps: 0 })
+        Ok(Descent { runner, handles, shape, steps: 0, begun: false })
     }
 
     /// Bytes of all buffers.
@@ -152,7 +144,7 @@ impl Descent {
         self.runner.plan().bytes()
     }
 
-    /// Floating-point operations of one step, matrix products only.
+    /// Floating-point operations of one step, matrix products only; not of the first after [`Descent::set_poses`], which may take more.
     pub fn flops_per_step(&self) -> u64 {
         self.runner.plan().flops(self.handles.evaluate)
     }
@@ -213,15 +205,11 @@ impl Descent {
             false => self.runner.write(self.handles.target, &wanted(target_rgb, weights))?,
         }
         self.runner.run(self.handles.instances)?;
-        if let Some(targets) = self.handles.targets {
-            self.runner.run(targets)?;
-        }
-        Ok(())
+        Ok(self.runner.run(self.handles.targets)?)
     }
 
-    /// Sets the poses. Forgets momentum, damping and best steps.
+    /// Sets the poses. Forgets momentum, second derivatives and best steps.
     pub fn set_poses(&mut self, poses: &[Pose6]) -> Result<(), Error> {
-        let n = poses.len();
         match self.handles.moves {
             Moves::Adam { pose6, moments, .. } => {
                 let values: Vec<f64> = poses.iter().flat_map(|pose| pose.0).collect();
@@ -230,17 +218,12 @@ impl Descent {
                     self.runner.write(moment, &vec![0.0; values.len()])?;
                 }
             }
-            Moves::LevenbergMarquardt { best_equations, best_pose, damping, .. } => {
+            Moves::Bfgs { .. } => {
                 let matrices: Vec<f64> = poses.iter().flat_map(|pose| to_rows(&pose.to_matrix())).collect();
                 self.runner.write_f64(self.handles.network.world_from_camera, &matrices)?;
-                self.runner.write_f64(best_pose, &matrices)?;
-                let mut nothing_yet = [0.0; lm::EQUATIONS as usize];
-                nothing_yet[LOSS] = f32::MAX;
-                self.runner.write(best_equations, &nothing_yet.repeat(n))?;
-                self.runner.write(damping, &vec![FIRST_DAMPING; n])?;
             }
         }
-        self.steps = 0;
+        (self.steps, self.begun) = (0, false);
         Ok(())
     }
 
@@ -249,9 +232,19 @@ impl Descent {
         Ok(self.runner.write(self.handles.network.z0, z0)?)
     }
 
+    /// Renders at the poses; losses are ready to be read.
+    pub fn compare(&mut self) -> Result<(), Error> {
+        Ok(self.runner.run(self.handles.compare)?)
+    }
+
     /// Renders at the poses; losses and gradients are ready to be read.
     pub fn evaluate(&mut self) -> Result<(), Error> {
-        Ok(self.runner.run(self.handles.evaluate)?)
+        let stage = match self.handles.moves {
+            Moves::Bfgs { begin, .. } if !self.begun => begin,
+            _ => self.handles.evaluate,
+        };
+        self.begun = true;
+        Ok(self.runner.run(stage)?)
     }
 
     /// One step from what [`Descent::evaluate`] found.
@@ -263,44 +256,45 @@ impl Descent {
         Ok(self.runner.run(self.handles.descend)?)
     }
 
-    /// Losses of the last evaluation, one per hypothesis.
+    /// Losses of the last comparison or evaluation, one per hypothesis.
     pub fn losses(&mut self) -> Result<Vec<f64>, Error> {
-        match self.handles.moves {
-            Moves::Adam { loss, .. } => Ok(self.runner.read(loss)?.into_iter().map(f64::from).collect()),
-            Moves::LevenbergMarquardt { equations, .. } => Ok(losses(&self.runner.read(equations)?)),
-        }
+        Ok(self.runner.read(self.handles.loss)?.into_iter().map(f64::from).collect())
     }
 
     /// The poses that the next evaluation renders.
     pub fn poses(&mut self) -> Result<Vec<Pose6>, Error> {
         match self.handles.moves {
             Moves::Adam { pose6, .. } => Ok(six_numbers(&self.runner.read(pose6)?).into_iter().map(Pose6).collect()),
-            Moves::LevenbergMarquardt { .. } => Ok(poses(&self.runner.read(self.handles.network.world_from_camera)?)),
+            Moves::Bfgs { .. } => Ok(poses(&self.runner.read(self.handles.network.world_from_camera)?)),
         }
     }
 
     /// Gradients of the last evaluation with respect to the six numbers that a step changes: the camera's own for Adam; a turn
-    /// about the object and a shift, in the camera's axes, for Levenberg–Marquardt.
+    /// about the object and a shift, in the camera's axes, for BFGS.
     pub fn gradients(&mut self) -> Result<Vec<[f64; 6]>, Error> {
         match self.handles.moves {
             Moves::Adam { d_pose6, .. } => Ok(six_numbers(&self.runner.read(d_pose6)?)),
-            Moves::LevenbergMarquardt { equations, .. } => {
+            // The first evaluation has them from the residuals.
+            Moves::Bfgs { equations, .. } if self.steps == 0 => {
                 let rows = self.runner.read(equations)?;
-                Ok(rows.chunks_exact(lm::EQUATIONS as usize).flat_map(|row| six_numbers(&row[21..LOSS])).collect())
+                Ok(rows.chunks_exact(bfgs::EQUATIONS as usize).flat_map(|row| six_numbers(&row[21..])).collect())
             }
+            Moves::Bfgs { gradient, .. } => Ok(six_numbers(&self.runner.read(gradient)?)),
         }
     }
 
-    /// Where each hypothesis stands after [`Descent::evaluate`], with its loss there: Adam at its last step, Levenberg–Marquardt
-    /// at its best.
+    /// Where each hypothesis stands, with its loss there: Adam at its last step, BFGS at its best.
     pub fn standing(&mut self) -> Result<Vec<(f64, Pose6)>, Error> {
-        let (losses, poses) = match self.handles.moves {
-            Moves::Adam { .. } => (self.losses()?, self.poses()?),
-            Moves::LevenbergMarquardt { best_equations, best_pose, .. } => {
-                (losses(&self.runner.read(best_equations)?), poses(&self.runner.read(best_pose)?))
-            }
-        };
-        Ok(losses.into_iter().zip(poses).collect())
+        let Moves::Bfgs { state, .. } = self.handles.moves else { return Ok(zip(self.losses()?, self.poses()?).collect()) };
+        if !self.begun {
+            return Ok(zip(self.losses()?, self.poses()?).collect());
+        }
+        let states = self.runner.read(state)?;
+        let standing = states.chunks_exact(bfgs::STATE as usize).map(|state| {
+            let rows = &state[bfgs::STATE_POSE..bfgs::STATE_POSE + 12];
+            (state[bfgs::STATE_LOSS].into(), Pose6::from_matrix(&from_rows(rows)))
+        });
+        Ok(standing.collect())
     }
 
     /// Colours of the last evaluation `[hypotheses, rays, 3]`.
@@ -312,13 +306,6 @@ impl Descent {
     pub fn executor(&mut self) -> &mut dyn Executor {
         &mut *self.runner
     }
-}
-
-/// Place of the loss in the normal equations.
-const LOSS: usize = lm::EQUATIONS as usize - 1;
-
-fn losses(equations: &[f32]) -> Vec<f64> {
-    equations.chunks_exact(lm::EQUATIONS as usize).map(|row| row[LOSS].into()).collect()
 }
 
 fn poses(matrices: &[f32]) -> Vec<Pose6> {
@@ -333,8 +320,8 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, method: Method, tile_rows
     let Shape { hypotheses, width, height, instances: slots } = shape;
     let rays_per_image = width * height;
     let batch = Batch { images: hypotheses, rays: rays_per_image, slots };
-    // Adam's matrices come from six numbers, those of Levenberg–Marquardt are what it moves.
-    let pose_is_input = matches!(method, Method::LevenbergMarquardt { .. });
+    // Adam's matrices come from six numbers, those of BFGS are what it moves.
+    let pose_is_input = matches!(method, Method::Bfgs { .. });
     let network = Network::new(b, model, batch, Trainable::Nothing, pose_is_input)?;
     let cut = tiles(hypotheses, rays_per_image, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
@@ -347,12 +334,81 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, method: Method, tile_rows
     let instances = b.stage("instances");
     forward::hypernetwork(b, &network, &hyper_saved)?;
 
-    let parts = Parts { network: &network, saved: &saved, scratch: &scratch, target, cut: &cut, most, shape };
-    let (targets, evaluate, descend, moves) = match method {
-        Method::Adam { loss, learning_rate } => adam_stages(b, &parts, loss, learning_rate)?,
-        Method::LevenbergMarquardt { soft } => levenberg_marquardt_stages(b, &parts, soft)?,
+    let loss = match method {
+        Method::Adam { loss, .. } => loss.per_pixel(),
+        Method::Bfgs { soft } => Some(image_loss::Kind::Charbonnier { soft }),
     };
-    Ok(Handles { network, target, gmsd, instances, targets, evaluate, descend, moves })
+    let comparison = Comparison::new(b, &network, &cut, shape, loss)?;
+    let parts = Parts { network: &network, saved: &saved, scratch: &scratch, target, cut: &cut, comparison: &comparison, shape };
+
+    let targets = b.stage("targets");
+    parts.look_at_targets(b)?;
+
+    let (compare, evaluate, descend, moves) = match method {
+        Method::Adam { learning_rate, .. } => parts.adam(b, learning_rate)?,
+        Method::Bfgs { soft } => parts.bfgs(b, soft)?,
+    };
+    let loss = comparison.loss;
+    Ok(Handles { network, target, gmsd, instances, targets, compare, evaluate, descend, loss, moves })
+}
+
+/// How renders are compared, with the buffers for it.
+struct Comparison {
+    kind: Kind,
+    tile_d_rgb: BufferId,
+    partial: BufferId,
+    loss: BufferId,
+}
+
+#[derive(Clone, Copy)]
+enum Kind {
+    /// `count`: of target values that are not white; `tile_target`: the tile's part of [`Handles::target`].
+    PerPixel {
+        kind: image_loss::Kind,
+        count: BufferId,
+        tile_target: BufferId,
+    },
+    Gmsd {
+        images: gmsd::Images,
+        saved: gmsd::Saved,
+        d_response: BufferId,
+        d_rgb: BufferId,
+    },
+}
+
+impl Comparison {
+    fn new(
+        b: &mut Builder,
+        network: &Network,
+        cut: &[Tile],
+        shape: Shape,
+        loss: Option<image_loss::Kind>,
+    ) -> Result<Self, PlanError> {
+        let Shape { hypotheses, width, height, .. } = shape;
+        let (n, most) = (hypotheses as usize, cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1) as usize);
+        let images = gmsd::Images { count: hypotheses, width, height };
+        let of_tile = |tile: &Tile| backward::partial_len(network, tile.rows).max(bfgs::partial_len(tile.rows));
+        let of_images = image_loss::partial_len(hypotheses, width * height).max(images.partial_len());
+        let partial = b.scratch("partial sums", cut.iter().map(of_tile).max().unwrap_or(1).max(of_images))?;
+        let kind = match loss {
+            Some(kind) => {
+                let (count, tile_target) = (b.scratch("target count", n)?, b.scratch("tile target", 4 * most)?);
+                Kind::PerPixel { kind, count, tile_target }
+            }
+            None => {
+                let pooled = n * images.pooled() as usize;
+                let saved = gmsd::Saved {
+                    luma: b.scratch("luma", pooled)?,
+                    target_luma: b.scratch("target luma", pooled)?,
+                    quality: b.scratch("quality", pooled)?,
+                    moments: b.scratch("moments", 2 * n)?,
+                };
+                let d_rgb = b.scratch("d rgb", 3 * n * (width * height) as usize)?;
+                Kind::Gmsd { images, saved, d_response: b.scratch("d response", 2 * pooled)?, d_rgb }
+            }
+        };
+        Ok(Comparison { kind, tile_d_rgb: b.scratch("tile d rgb", 3 * most)?, partial, loss: b.scratch("loss", n)? })
+    }
 }
 
 /// What both methods work with.
@@ -362,140 +418,157 @@ struct Parts<'a> {
     scratch: &'a Scratch,
     target: BufferId,
     cut: &'a [Tile],
-    /// Rows of the largest tile.
-    most: u32,
+    comparison: &'a Comparison,
     shape: Shape,
 }
 
-type Stages = (Option<StageId>, StageId, StageId, Moves);
+/// Stages "compare", "evaluate" and "descend", and the buffers of the poses.
+type Stages = (StageId, StageId, StageId, Moves);
 
-/// Stages "targets", "evaluate" and "descend" of the paper's method.
-fn adam_stages(b: &mut Builder, parts: &Parts, loss: Loss, learning_rate: f64) -> Result<Stages, PlanError> {
-    let &Parts { network, saved, scratch, target, cut, most, shape: Shape { hypotheses, width, height, .. } } = parts;
-    let rays_per_image = width * height;
-    let n = hypotheses as usize;
-    let images = gmsd::Images { count: hypotheses, width, height };
-    let partial_len = cut.iter().map(|tile| backward::partial_len(network, tile.rows)).max().unwrap_or(1);
-    let sums = image_loss::partial_len(hypotheses, rays_per_image).max(images.partial_len());
-    let partial = b.scratch("partial sums", partial_len.max(sums))?;
-    let tile_d_rgb = b.scratch("tile d rgb", 3 * most as usize)?;
-    let loss_buffer = b.scratch("loss", n)?;
-    let pose6 = b.input("pose6", 6 * n)?;
-    let (d_pose6, d_matrix) = (b.scratch("d pose6", 6 * n)?, b.scratch("d world_from_camera", 12 * n)?);
-
-    let targets = b.stage("targets");
-    // Per-pixel losses need the number of target values that are not white; GMSD needs the target's luma.
-    let comparison = match loss.per_pixel() {
-        Some(kind) => {
-            let count = b.scratch("target count", n)?;
-            image_loss::count(b, hypotheses, rays_per_image, target, partial, count)?;
-            Comparison::PerPixel { kind, count, tile_target: b.scratch("tile target", 4 * most as usize)? }
+impl Parts<'_> {
+    /// Per-pixel losses need the number of target values that are not white; GMSD needs the target's luma.
+    fn look_at_targets(&self, b: &mut Builder) -> Result<(), PlanError> {
+        let Shape { hypotheses, width, height, .. } = self.shape;
+        match self.comparison.kind {
+            Kind::PerPixel { count, .. } => {
+                image_loss::count(b, hypotheses, width * height, self.target, self.comparison.partial, count)
+            }
+            Kind::Gmsd { images, saved, .. } => gmsd::pool(b, images, self.target, saved.target_luma),
         }
-        None => {
-            let pooled = n * images.pooled() as usize;
-            let saved = gmsd::Saved {
-                luma: b.scratch("luma", pooled)?,
-                target_luma: b.scratch("target luma", pooled)?,
-                quality: b.scratch("quality", pooled)?,
-                moments: b.scratch("moments", 2 * n)?,
-            };
-            gmsd::pool(b, images, target, saved.target_luma)?;
-            let d_rgb = b.scratch("d rgb", 3 * n * rays_per_image as usize)?;
-            Comparison::Gmsd { saved, d_response: b.scratch("d response", 2 * pooled)?, d_rgb }
-        }
-    };
+    }
 
-    let evaluate = b.stage("evaluate");
-    let mut started = Started::default();
-    pose::forward(b, hypotheses, pose6, network.world_from_camera)?;
-    // A loss of whole images needs all tiles before the first gradient; the tiles are rendered once more on the way back.
-    if let Comparison::Gmsd { saved: maps, d_response, d_rgb } = comparison {
+    /// Losses of the whole images in `network.rgb`.
+    fn losses(&self, b: &mut Builder) -> Result<(), PlanError> {
+        let Shape { hypotheses, width, height, .. } = self.shape;
+        let &Comparison { kind, partial, loss, .. } = self.comparison;
+        match kind {
+            Kind::PerPixel { kind, count, .. } => {
+                let pixels = width * height;
+                image_loss::forward(b, kind, hypotheses, pixels, self.network.rgb, self.target, count, partial, loss)
+            }
+            Kind::Gmsd { images, saved, .. } => {
+                gmsd::pool(b, images, self.network.rgb, saved.luma)?;
+                gmsd::similarity(b, images, saved)?;
+                gmsd::deviation(b, images, saved, partial, loss)
+            }
+        }
+    }
+
+    /// Renders and compares.
+    fn compare(&self, b: &mut Builder) -> Result<(), PlanError> {
+        for &tile in self.cut {
+            forward::render(b, self.network, self.saved, tile)?;
+        }
+        self.losses(b)
+    }
+
+    /// Renders, compares, and goes back to the poses: losses, and `d_matrix [hypotheses, 12]`.
+    fn differentiate(&self, b: &mut Builder, d_matrix: BufferId) -> Result<(), PlanError> {
+        let &Parts { network, saved, scratch, target, cut, comparison, shape: Shape { width, height, .. } } = self;
+        let &Comparison { kind, tile_d_rgb, partial, loss } = comparison;
+        let mut started = Started::default();
+        // A loss of whole images needs all tiles before the first gradient; the tiles are rendered once more on the way back.
+        if let Kind::Gmsd { images, saved: maps, d_response, d_rgb } = kind {
+            self.compare(b)?;
+            gmsd::backward(b, images, 1.0, maps, loss, d_response, d_rgb)?;
+        }
+        for &tile in cut {
+            match kind {
+                Kind::PerPixel { kind, count, tile_target } => {
+                    forward::render(b, network, saved, tile)?;
+                    tile_ops::gather(b, tile, 4, target, tile_target)?;
+                    let pixels = width * height;
+                    image_loss::backward(b, kind, tile.rows, pixels, 1.0, saved.rgb(), tile_target, count, tile_d_rgb)?;
+                }
+                Kind::Gmsd { d_rgb, .. } => {
+                    if cut.len() > 1 {
+                        forward::render(b, network, saved, tile)?;
+                    }
+                    tile_ops::gather(b, tile, 3, d_rgb, tile_d_rgb)?;
+                }
+            }
+            backward::render(b, network, saved, scratch, partial, tile, tile_d_rgb, false, &mut started)?;
+            let accumulate = started.accumulate(d_matrix, tile.rows.first_group);
+            let pixels = network.pixels(saved);
+            rays::backward(b, tile.rows, pixels, scratch.d_origin, scratch.d_direction, partial, d_matrix, accumulate)?;
+        }
+        if matches!(kind, Kind::PerPixel { .. }) {
+            self.losses(b)?;
+        }
+        Ok(())
+    }
+
+    /// The paper's method.
+    fn adam(&self, b: &mut Builder, learning_rate: f64) -> Result<Stages, PlanError> {
+        let (poses, n) = (self.shape.hypotheses, self.shape.hypotheses as usize);
+        let pose6 = b.input("pose6", 6 * n)?;
+        let (d_pose6, d_matrix) = (b.scratch("d pose6", 6 * n)?, b.scratch("d world_from_camera", 12 * n)?);
+
+        let compare = b.stage("compare");
+        pose::forward(b, poses, pose6, self.network.world_from_camera)?;
+        self.compare(b)?;
+
+        let evaluate = b.stage("evaluate");
+        pose::forward(b, poses, pose6, self.network.world_from_camera)?;
+        self.differentiate(b, d_matrix)?;
+        pose::backward(b, poses, pose6, d_matrix, d_pose6)?;
+
+        let descend = b.stage("descend");
+        let schedule = b.input("schedule", 3)?;
+        let moments = [b.input("m pose6", 6 * n)?, b.input("v pose6", 6 * n)?];
+        adam::step(b, 6 * poses, d_pose6, schedule, pose6, moments[0], moments[1])?;
+        Ok((compare, evaluate, descend, Moves::Adam { learning_rate, pose6, d_pose6, schedule, moments }))
+    }
+
+    /// BFGS. Its first evaluation is another stage, "begin": rays are independent, so one backward pass for each channel, begun with the
+    /// same number for every ray, gives every ray's derivative of that channel, the rows of the Jacobian.
+    fn bfgs(&self, b: &mut Builder, soft: f32) -> Result<Stages, PlanError> {
+        let &Parts { network, saved, scratch, target, cut, comparison, shape: Shape { hypotheses, width, height, .. } } = self;
+        let &Comparison { kind, partial, loss, .. } = comparison;
+        let Kind::PerPixel { tile_target, .. } = kind else { unreachable!("BFGS compares pixel by pixel") };
+        let n = hypotheses as usize;
+        let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1) as usize;
+        let mut seed = |name: &str| b.input(name, 3 * most);
+        let seeds = [seed("seed of red")?, seed("seed of green")?, seed("seed of blue")?];
+        let equations = b.scratch("equations", n * bfgs::EQUATIONS as usize)?;
+        let (state, gradient) = (b.scratch("state", n * bfgs::STATE as usize)?, b.scratch("gradient", 6 * n)?);
+        let d_matrix = b.scratch("d world_from_camera", 12 * n)?;
+
+        let compare = b.stage("compare");
+        self.compare(b)?;
+
+        let begin = b.stage("begin");
+        let mut started = Started::default();
+        let residuals = Residuals {
+            world_from_camera: network.world_from_camera,
+            origin: saved.x[0],
+            direction: saved.direction,
+            d_origin: scratch.d_origin,
+            d_direction: scratch.d_direction,
+            rgb: saved.rgb(),
+            wanted: tile_target,
+        };
+        let scale = 1.0 / (3 * width * height) as f32;
         for &tile in cut {
             forward::render(b, network, saved, tile)?;
-        }
-        gmsd::pool(b, images, network.rgb, maps.luma)?;
-        gmsd::similarity(b, images, maps)?;
-        gmsd::deviation(b, images, maps, partial, loss_buffer)?;
-        gmsd::backward(b, images, 1.0, maps, loss_buffer, d_response, d_rgb)?;
-    }
-    for &tile in cut {
-        match comparison {
-            Comparison::PerPixel { kind, count, tile_target } => {
-                forward::render(b, network, saved, tile)?;
-                tile_ops::gather(b, tile, 4, target, tile_target)?;
-                image_loss::backward(b, kind, tile.rows, rays_per_image, 1.0, saved.rgb(), tile_target, count, tile_d_rgb)?;
-            }
-            Comparison::Gmsd { d_rgb, .. } => {
-                if cut.len() > 1 {
-                    forward::render(b, network, saved, tile)?;
-                }
-                tile_ops::gather(b, tile, 3, d_rgb, tile_d_rgb)?;
+            tile_ops::gather(b, tile, 4, target, tile_target)?;
+            for (number, d_rgb) in (0..).zip(seeds) {
+                backward::render(b, network, saved, scratch, partial, tile, d_rgb, false, &mut started)?;
+                let channel = Channel { number, seed: SEED, scale, soft };
+                let accumulate = started.accumulate(equations, tile.rows.first_group);
+                bfgs::equations(b, tile.rows, residuals, channel, partial, equations, accumulate)?;
             }
         }
-        backward::render(b, network, saved, scratch, partial, tile, tile_d_rgb, false, &mut started)?;
-        let accumulate = started.accumulate(d_matrix, tile.rows.first_group);
-        let pixels = network.pixels(saved);
-        rays::backward(b, tile.rows, pixels, scratch.d_origin, scratch.d_direction, partial, d_matrix, accumulate)?;
+        self.losses(b)?;
+        bfgs::begin(b, hypotheses, equations, loss, network.world_from_camera, state)?;
+
+        let evaluate = b.stage("evaluate");
+        self.differentiate(b, d_matrix)?;
+        bfgs::gradient(b, hypotheses, network.world_from_camera, d_matrix, gradient)?;
+        bfgs::update(b, hypotheses, gradient, loss, network.world_from_camera, state)?;
+
+        let descend = b.stage("descend");
+        bfgs::solve(b, hypotheses, network.world_from_camera, state)?;
+        Ok((compare, evaluate, descend, Moves::Bfgs { begin, equations, gradient, state, seeds }))
     }
-    if let Comparison::PerPixel { kind, count, .. } = comparison {
-        image_loss::forward(b, kind, hypotheses, rays_per_image, network.rgb, target, count, partial, loss_buffer)?;
-    }
-    pose::backward(b, hypotheses, pose6, d_matrix, d_pose6)?;
-
-    let descend = b.stage("descend");
-    let schedule = b.input("schedule", 3)?;
-    let moments = [b.input("m pose6", 6 * n)?, b.input("v pose6", 6 * n)?];
-    adam::step(b, 6 * hypotheses, d_pose6, schedule, pose6, moments[0], moments[1])?;
-    Ok((Some(targets), evaluate, descend, Moves::Adam { learning_rate, pose6, d_pose6, loss: loss_buffer, schedule, moments }))
-}
-
-/// Stages "evaluate" and "descend" of Levenberg–Marquardt. Rays are independent, so one backward pass for each channel, begun with
-/// the same number for every ray, gives every ray's derivative of that channel: the rows of the Jacobian.
-fn levenberg_marquardt_stages(b: &mut Builder, parts: &Parts, soft: f32) -> Result<Stages, PlanError> {
-    let &Parts { network, saved, scratch, target, cut, most, shape: Shape { hypotheses, width, height, .. } } = parts;
-    let n = hypotheses as usize;
-    let len = |tile: &Tile| backward::partial_len(network, tile.rows).max(lm::partial_len(tile.rows));
-    let partial = b.scratch("partial sums", cut.iter().map(len).max().unwrap_or(1))?;
-    let tile_target = b.scratch("tile target", 4 * most as usize)?;
-    let mut seed = |name: &str| b.input(name, 3 * most as usize);
-    let seeds = [seed("seed of red")?, seed("seed of green")?, seed("seed of blue")?];
-    let values = n * lm::EQUATIONS as usize;
-    let equations = b.scratch("equations", values)?;
-    let (best_equations, best_pose) = (b.input("best equations", values)?, b.input("best pose", 12 * n)?);
-    let damping = b.input("damping", n)?;
-
-    let evaluate = b.stage("evaluate");
-    let mut started = Started::default();
-    let residuals = Residuals {
-        world_from_camera: network.world_from_camera,
-        origin: saved.x[0],
-        direction: saved.direction,
-        d_origin: scratch.d_origin,
-        d_direction: scratch.d_direction,
-        rgb: saved.rgb(),
-        wanted: tile_target,
-    };
-    let scale = 1.0 / (3 * width * height) as f32;
-    for &tile in cut {
-        forward::render(b, network, saved, tile)?;
-        tile_ops::gather(b, tile, 4, target, tile_target)?;
-        for (number, d_rgb) in (0..).zip(seeds) {
-            backward::render(b, network, saved, scratch, partial, tile, d_rgb, false, &mut started)?;
-            let channel = Channel { number, seed: SEED, scale, soft };
-            let accumulate = started.accumulate(equations, tile.rows.first_group);
-            lm::equations(b, tile.rows, residuals, channel, partial, equations, accumulate)?;
-        }
-    }
-    lm::accept(b, hypotheses, equations, network.world_from_camera, best_equations, best_pose, damping)?;
-
-    let descend = b.stage("descend");
-    lm::solve(b, hypotheses, best_equations, best_pose, damping, network.world_from_camera)?;
-    Ok((None, evaluate, descend, Moves::LevenbergMarquardt { equations, best_equations, best_pose, damping, seeds }))
-}
-
-/// How renders are compared, with the buffers for it.
-#[derive(Clone, Copy)]
-enum Comparison {
-    PerPixel { kind: image_loss::Kind, count: BufferId, tile_target: BufferId },
-    Gmsd { saved: gmsd::Saved, d_response: BufferId, d_rgb: BufferId },
 }

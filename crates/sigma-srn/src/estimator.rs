@@ -53,16 +53,16 @@ pub struct Options {
 }
 
 impl Default for Options {
-    /// Levenberg–Marquardt: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the
-    /// best two on all: the loss has small minima side by side.
+    /// BFGS: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the best three on
+    /// all, until they stand still: the loss has minima side by side.
     fn default() -> Self {
         let phases = vec![
             Phase { steps: 0, stride: 4, keep: usize::MAX },
             Phase { steps: 8, stride: 4, keep: 16 },
-            Phase { steps: 8, stride: 2, keep: 4 },
-            Phase { steps: 8, stride: 1, keep: 2 },
+            Phase { steps: 8, stride: 2, keep: 6 },
+            Phase { steps: 14, stride: 1, keep: 3 },
         ];
-        Options { method: Method::LevenbergMarquardt { soft: 0.3 }, phases, seed: 0 }
+        Options { method: Method::Bfgs { soft: 0.3 }, phases, seed: 0 }
     }
 }
 
@@ -191,7 +191,7 @@ pub fn estimate(
         let mut descent = prepare(engine, model, queries, options, phase, &running)?;
         let rows = running.len() * rays_of(&queries[0], phase.stride).count();
         for _ in 0..phase.steps {
-            // New depths in every step, as in the paper; but whether Levenberg–Marquardt keeps a step must not depend on luck.
+            // New depths in every step, as in the paper; but whether BFGS keeps a step must not depend on luck.
             if matches!(options.method, Method::Adam { .. }) {
                 let mut random = stream(options.seed, 1 + u64::from(step));
                 descent.set_initial_depths(&initial_depths(&mut random, rows))?;
@@ -201,12 +201,16 @@ pub fn estimate(
             descent.descend()?;
             step += 1;
         }
-        descent.evaluate()?;
+        if phase.steps == 0 {
+            descent.compare()?;
+        } else {
+            descent.evaluate()?;
+        }
         observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
         for (hypothesis, standing) in running.iter_mut().zip(descent.standing()?) {
             (hypothesis.loss, hypothesis.pose) = standing;
-            // A NaN must not win; the largest f32 is what a descent holds that never had another.
-            if hypothesis.loss.is_nan() || hypothesis.loss >= f32::MAX.into() {
+            // A NaN must not win; something near the largest f32 is what a descent holds that never had another.
+            if hypothesis.loss.is_nan() || hypothesis.loss > 1e38 {
                 hypothesis.loss = f64::INFINITY;
             }
             hypothesis.phases = number + 1;

@@ -24,7 +24,7 @@ const RENDER_BATCH: usize = 8;
 #[derive(Args, Clone, Debug)]
 #[command(next_help_heading = "Search")]
 pub struct SearchArgs {
-    /// `default`: Levenberg–Marquardt about the object, all starts on few rays, then only the most promising on more. `paper`: 300
+    /// `default`: BFGS about the object, all starts on few rays, then only the most promising on more. `paper`: 300
     /// steps of Adam on the camera's six numbers for every start, on all pixels; the last step counts.
     #[arg(long, value_enum, default_value_t = Preset::Default)]
     preset: Preset,

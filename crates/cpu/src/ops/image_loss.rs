@@ -1,17 +1,37 @@
-//! MAE, MSE, norm_l1, norm_l2: sums over an image's values times a normaliser.
+//! MAE, MSE, norm_l1, norm_l2, Charbonnier: sums over an image's values times a normaliser.
 
 use srn_shaders::ImageLossParams;
 
 use super::chunk_of;
 use crate::Real;
 
-/// MSE and norm_l2 square the residual.
-fn squares(p: ImageLossParams) -> bool {
-    p.kind % 2 == 1
+/// `ρ(e)`: `|e|` (MAE, norm_l1), `e²` (MSE, norm_l2), `√(e² + soft²) - soft` (Charbonnier).
+fn rho<T: Real>(p: ImageLossParams, e: T) -> T {
+    match p.kind {
+        0 | 2 => e.abs(),
+        1 | 3 => e * e,
+        _ => {
+            let soft = T::of_f32(p.soft);
+            e * e / ((e * e + soft * soft).sqrt() + soft)
+        }
+    }
+}
+
+/// `ρ'(e)`, 0 where it has a kink.
+fn slope<T: Real>(p: ImageLossParams, e: T) -> T {
+    match p.kind {
+        0 | 2 if e == T::zero() => T::zero(),
+        0 | 2 => e.signum(),
+        1 | 3 => e + e,
+        _ => {
+            let soft = T::of_f32(p.soft);
+            e / (e * e + soft * soft).sqrt()
+        }
+    }
 }
 
 fn normaliser<T: Real>(p: ImageLossParams, count: T) -> T {
-    T::one() / if p.kind < 2 { T::of(p.values_per_image.into()) } else { T::one() + count }
+    T::one() / if matches!(p.kind, 2 | 3) { T::one() + count } else { T::of(p.values_per_image.into()) }
 }
 
 /// `f` of image, row and channel, times the row's weight, summed over each chunk of each image's rows.
@@ -36,24 +56,17 @@ pub fn count<T: Real>(p: ImageLossParams, wanted: &[T], partial: &mut [T]) {
 pub fn forward<T: Real>(p: ImageLossParams, rgb: &[T], wanted: &[T], count: &[T], partial: &mut [T]) {
     sums(p, wanted, partial, |group, row, channel| {
         let e = rgb[3 * row + channel] - wanted[4 * row + channel];
-        normaliser(p, count[p.first_group as usize + group]) * if squares(p) { e * e } else { e.abs() }
+        normaliser(p, count[p.first_group as usize + group]) * rho(p, e)
     });
 }
 
-/// `d_rgb = scale · normaliser · w · sign(e)`, or `· 2e`.
+/// `d_rgb = scale · normaliser · w · ρ'(e)`.
 pub fn backward<T: Real>(p: ImageLossParams, rgb: &[T], wanted: &[T], count: &[T], d_rgb: &mut [T]) {
     let values_per_group = 3 * p.rows_per_group as usize;
     for value in 0..p.groups as usize * values_per_group {
         let row = value / 3;
         let e = rgb[value] - wanted[value + row];
-        let d = if squares(p) {
-            e + e
-        } else if e == T::zero() {
-            T::zero()
-        } else {
-            e.signum()
-        };
         let image = p.first_group as usize + value / values_per_group;
-        d_rgb[value] = T::of_f32(p.scale) * normaliser(p, count[image]) * wanted[4 * row + 3] * d;
+        d_rgb[value] = T::of_f32(p.scale) * normaliser(p, count[image]) * wanted[4 * row + 3] * slope(p, e);
     }
 }

@@ -2,6 +2,7 @@
 
 pub mod adam;
 pub mod advance;
+pub mod bfgs;
 pub mod density_sum;
 pub mod depth;
 pub mod depth_loss;
@@ -10,7 +11,6 @@ pub mod gmsd;
 pub mod image_loss;
 pub mod latent_loss;
 pub mod layer_norm_relu;
-pub mod levenberg_marquardt;
 pub mod linear;
 pub mod lstm_cell;
 pub mod pack_rgba8;

@@ -1,4 +1,4 @@
-//! Losses that are a sum over pixels: MAE, MSE, norm_l1, norm_l2 (spec 4). `wanted [rows,4]` is a pixel's colour and how much it counts.
+//! Losses that are a sum over pixels: MAE, MSE, norm_l1, norm_l2 (spec 4), Charbonnier. `wanted [rows,4]` is a pixel's colour and how much it counts.
 
 use srn_shaders::{IMAGE_LOSS_BACKWARD, IMAGE_LOSS_COUNT, IMAGE_LOSS_FORWARD, ImageLossParams};
 
@@ -9,17 +9,21 @@ use crate::{BufferId, Builder, PlanError, Rows};
 const CHUNK_ROWS: u32 = 256;
 
 /// Which sum, and divided by what.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u32)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Kind {
     /// Mean of `|e|` over an image's values.
-    Mae = 0,
+    Mae,
     /// Mean of `e²`.
-    Mse = 1,
+    Mse,
     /// Sum of `|e|`, divided by one plus the number of wanted values that are not exactly 1.
-    NormL1 = 2,
+    NormL1,
     /// Sum of `e²`, divided likewise.
-    NormL2 = 3,
+    NormL2,
+    /// Mean of `√(e² + soft²) - soft`.
+    Charbonnier {
+        /// Residual at which it turns from squares to absolute values.
+        soft: f32,
+    },
 }
 
 /// Length of the partial sums, for `images` of `pixels`.
@@ -96,8 +100,15 @@ fn loops() -> u64 {
 }
 
 fn params(kind: Kind, rows: Rows, pixels: u32, scale: f32) -> ImageLossParams {
+    let (number, soft) = match kind {
+        Kind::Mae => (0, 0.0),
+        Kind::Mse => (1, 0.0),
+        Kind::NormL1 => (2, 0.0),
+        Kind::NormL2 => (3, 0.0),
+        Kind::Charbonnier { soft } => (4, soft),
+    };
     ImageLossParams {
-        kind: kind as u32,
+        kind: number,
         groups: rows.groups,
         rows_per_group: rows.rows_per_group,
         first_group: rows.first_group,
@@ -105,5 +116,6 @@ fn params(kind: Kind, rows: Rows, pixels: u32, scale: f32) -> ImageLossParams {
         chunk_rows: CHUNK_ROWS,
         chunks: rows.rows_per_group.div_ceil(CHUNK_ROWS),
         scale,
+        soft,
     }
 }

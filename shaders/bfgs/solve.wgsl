@@ -1,25 +1,17 @@
-// (A + damping diag A) ξ = -g, times max(1, √(0.01 / damping)), |ξ| ≤ 0.2; (ω, υ) = ξ, E = exp(ω): R' = R E, t' = R (E Rᵀt + υ).
-// One invocation solves for one pose, by Cholesky's factors.
-// equations [B, 28] = (upper triangle of A, g, loss), pose [B, 12], damping [B] → world_from_camera [B, 12].
-// OVERWRITES world_from_camera; it is the old pose where A is not positive.
+// B ξ = -g, shortened to the radius; (ω, υ) = ξ, E = exp(ω): R' = R E, t' = R (E Rᵀt + υ).
+// One invocation solves for one pose, by Cholesky's factors; ξ goes along -g where B is not positive.
+// state [B, 47] → world_from_camera [B, 12].
+// OVERWRITES world_from_camera and the step in state.
 
-// ξ turns and shifts the camera about the world's origin, in the camera's axes. It is stretched while steps are being kept: where the
-// derivatives of neighbouring rays disagree, the step of least squares is far shorter than the way to the minimum.
+// ξ turns and shifts the camera about the world's origin, in the camera's axes.
 
 struct Params {
     poses: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> equations: array<f32>;
-@group(0) @binding(2) var<storage, read> pose: array<f32>;
-@group(0) @binding(3) var<storage, read> damping: array<f32>;
-@group(0) @binding(4) var<storage, read_write> world_from_camera: array<f32>;
-
-// Row a of the upper triangle begins at 6a - a(a-1)/2; entry (a, b), a ≤ b.
-fn entry(a: u32, b: u32) -> u32 {
-    return a * (11u - a) / 2u + b;
-}
+@group(0) @binding(1) var<storage, read_write> world_from_camera: array<f32>;
+@group(0) @binding(2) var<storage, read_write> state: array<f32>;
 
 @compute @workgroup_size(64)
 fn main(
@@ -31,18 +23,15 @@ fn main(
     if (number >= params.poses) {
         return;
     }
-    let at = 28u * number;
+    let at = STATE * number;
     // Rows of the lower factor L, then L y = -g, then Lᵀ ξ = y.
     var lower: array<array<f32, 6>, 6>;
     var xi: array<f32, 6>;
     var solvable = true;
     for (var i = 0u; i < 6u; i++) {
-        var y = -equations[at + 21u + i];
+        var y = -state[at + STATE_GRADIENT + i];
         for (var j = 0u; j <= i; j++) {
-            var sum = equations[at + entry(j, i)];
-            if (i == j) {
-                sum *= 1.0 + damping[number];
-            }
+            var sum = state[at + entry(j, i)];
             for (var k = 0u; k < j; k++) {
                 sum -= lower[i][k] * lower[j][k];
             }
@@ -56,29 +45,38 @@ fn main(
         }
         xi[i] = y / lower[i][i];
     }
-    var squares = 0.0;
     for (var back = 0u; back < 6u; back++) {
         let i = 5u - back;
         for (var k = i + 1u; k < 6u; k++) {
             xi[i] -= lower[k][i] * xi[k];
         }
         xi[i] /= lower[i][i];
+    }
+    var squares = 0.0;
+    for (var i = 0u; i < 6u; i++) {
+        if (!solvable) {
+            xi[i] = -state[at + STATE_GRADIENT + i];
+        }
         squares += xi[i] * xi[i];
     }
-    // Not finite where a factor is zero.
     let size = sqrt(squares);
-    let usable = solvable && size > 0.0 && size < 1e30;
-    let factor = min(max(1.0, sqrt(0.01 / damping[number])), 0.2 / size);
-    let turn = select(vec3(0.0), factor * vec3(xi[0], xi[1], xi[2]), usable);
-    let shift = select(vec3(0.0), factor * vec3(xi[3], xi[4], xi[5]), usable);
+    let usable = size > 0.0 && size < 1e30;
+    let factor = min(1.0, state[at + STATE_RADIUS] / size);
+    for (var i = 0u; i < 6u; i++) {
+        xi[i] = select(0.0, factor * xi[i], usable);
+        state[at + STATE_STEP + i] = xi[i];
+    }
+    let turn = vec3(xi[0], xi[1], xi[2]);
+    let shift = vec3(xi[3], xi[4], xi[5]);
 
+    let p = at + STATE_POSE;
     let w = 12u * number;
     let r = mat3x3(
-        pose[w], pose[w + 4u], pose[w + 8u],
-        pose[w + 1u], pose[w + 5u], pose[w + 9u],
-        pose[w + 2u], pose[w + 6u], pose[w + 10u],
+        state[p], state[p + 4u], state[p + 8u],
+        state[p + 1u], state[p + 5u], state[p + 9u],
+        state[p + 2u], state[p + 6u], state[p + 10u],
     );
-    let centre = vec3(pose[w + 3u], pose[w + 7u], pose[w + 11u]) * r;
+    let centre = vec3(state[p + 3u], state[p + 7u], state[p + 11u]) * r;
     // Rodrigues: exp(ω) v = v + sin|ω|/|ω| ω×v + (1 - cos|ω|)/|ω|² ω×(ω×v), the factors by half angles and series.
     let angle2 = dot(turn, turn);
     let angle = sqrt(angle2);

@@ -1,10 +1,10 @@
-// A = Σ ω J Jᵀ, g = Σ ω e J, loss = scale Σ w ρ(e): e = rgb - wanted, ρ = √(e² + s²) - s, ω = scale w / √(e² + s²), J = ∂rgb/∂ξ of one channel.
+// A = Σ ω J Jᵀ, g = Σ ω e J: e = rgb - wanted, ω = scale w / √(e² + s²), J = ∂rgb/∂ξ of one channel.
 // One invocation sums one chunk of the rows of one image.
-// world_from_camera [images, 12], origin, direction, d_origin, d_direction, rgb [rows, 3], wanted [rows, 4] = (r, g, b, w) → partial [groups, chunks, 28].
+// world_from_camera [images, 12], origin, direction, d_origin, d_direction, rgb [rows, 3], wanted [rows, 4] = (r, g, b, w) → partial [groups, chunks, 27].
 // OVERWRITES partial.
 
 // The motion ξ = (ω, υ) turns the ray about the world's origin and shifts it, both in the camera's axes.
-// Of the 28 values, 21 are the upper triangle of A by rows, 6 are g, the last is the loss.
+// Of the 27 values, 21 are the upper triangle of A by rows, 6 are g.
 
 struct Params {
     groups: u32,
@@ -46,14 +46,13 @@ fn main(
     let column1 = vec3(world_from_camera[w + 1u], world_from_camera[w + 5u], world_from_camera[w + 9u]);
     let column2 = vec3(world_from_camera[w + 2u], world_from_camera[w + 6u], world_from_camera[w + 10u]);
 
-    var sums: array<f32, 28>;
+    var sums: array<f32, 27>;
     for (var r = first; r < end; r++) {
         let at = 3u * (group * params.rows_per_group + r);
         let pixel = 4u * (group * params.rows_per_group + r);
         let e = rgb[at + params.channel] - wanted[pixel + params.channel];
         let root = sqrt(e * e + params.soft * params.soft);
-        let counts = params.scale * wanted[pixel + 3u];
-        let weight = counts / root;
+        let weight = params.scale * wanted[pixel + 3u] / root;
 
         let d_o = vec3(d_origin[at], d_origin[at + 1u], d_origin[at + 2u]) / params.seed;
         let d_d = vec3(d_direction[at], d_direction[at + 1u], d_direction[at + 2u]) / params.seed;
@@ -71,10 +70,8 @@ fn main(
             }
             sums[21u + a] += weight * e * jacobian[a];
         }
-        // The same as root - soft, without the cancellation.
-        sums[27] += counts * e * e / (root + params.soft);
     }
-    for (var k = 0u; k < 28u; k++) {
-        partial[28u * index + k] = sums[k];
+    for (var k = 0u; k < 27u; k++) {
+        partial[27u * index + k] = sums[k];
     }
 }
