@@ -1,7 +1,7 @@
 //! Triangles with colours and textures, ready to be drawn.
 
 use crate::error::{Error, Result};
-use glam::{Affine3A, Vec2, Vec3};
+use glam::{Affine3A, Mat3, Vec2, Vec3};
 use image::RgbaImage;
 use std::ops::Range;
 use std::path::Path;
@@ -52,6 +52,17 @@ pub enum Up {
     MinusY,
 }
 
+impl From<Up> for Mat3 {
+    /// The rotation from the file's axes to ours, which leaves x as it is.
+    fn from(up: Up) -> Self {
+        Mat3::from_cols_array(&match up {
+            Up::Y => [1., 0., 0., 0., 0., 1., 0., -1., 0.],
+            Up::MinusY => [1., 0., 0., 0., 0., -1., 0., 1., 0.],
+            Up::Z => [1., 0., 0., 0., 1., 0., 0., 0., 1.],
+        })
+    }
+}
+
 impl Mesh {
     /// Adds a triangle with a flat normal to the last part. Degenerate triangles are dropped.
     pub(crate) fn push_flat(&mut self, corners: [Vec3; 3], colour: Vec3) {
@@ -72,13 +83,10 @@ impl Mesh {
         [positions().fold(Vec3::MAX, Vec3::min), positions().fold(Vec3::MIN, Vec3::max)]
     }
 
-    /// Turns the mesh z-up, moves its bounding box to the origin and scales the box's diagonal to 1.
-    pub fn normalise(&mut self, up: Up) {
-        let turn = glam::Mat3::from_cols_array(&match up {
-            Up::Y => [1., 0., 0., 0., 0., 1., 0., -1., 0.],
-            Up::MinusY => [1., 0., 0., 0., 0., -1., 0., 1., 0.],
-            Up::Z => [1., 0., 0., 0., 1., 0., 0., 0., 1.],
-        });
+    /// Turns the mesh z-up, moves its bounding box to the origin and scales the box's diagonal to 1. `turn` is which axis of
+    /// the file points up, or the whole rotation from the file's axes to ours.
+    pub fn normalise(&mut self, turn: impl Into<Mat3>) {
+        let turn = turn.into();
         let [low, high] = self.bounds();
         let scale = 1.0 / (high - low).length().max(f32::MIN_POSITIVE);
         let placed = Affine3A::from_mat3(turn * scale) * Affine3A::from_translation(-0.5 * (low + high));
