@@ -6,7 +6,7 @@ use sigma_cli::common::{Result, finish};
 use sigma_cli::data::{Export, Import, Inspect};
 use srn_data::mesh::{Mesh, Up};
 use srn_data::srn::{InstanceWriter, Intrinsics};
-use srn_data::{camera, gltf, ldraw, obj, ply, stl};
+use srn_data::{ac3d, camera, gltf, ldraw, obj, ply, stl};
 use srn_gpu::raster::{self, Rasterizer};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -184,6 +184,7 @@ fn load_mesh(path: &Path, up: Option<MeshUp>) -> Result<Mesh> {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     let (mut mesh, usual) = match extension.as_str() {
         "dat" => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
+        "ac" | "acc" => (ac3d::load(path)?, Up::Y),
         "obj" => (obj::load(path)?, Up::Y),
         "gltf" | "glb" => (gltf::load(path)?, Up::Y),
         "stl" => (stl::load(path)?, Up::Z),
