@@ -9,7 +9,7 @@ use image::RgbImage;
 use indicatif::ProgressBar;
 use srn_data::mesh::{Mesh, Up};
 use srn_data::srn::{InstanceWriter, Intrinsics};
-use srn_data::{camera, gltf, ldraw, obj, ply, sheet, stl};
+use srn_data::{ac3d, camera, gltf, ldraw, obj, ply, sheet, stl};
 use srn_gpu::raster::{self, Rasterizer};
 
 use crate::common::{Result, progress};
@@ -20,7 +20,7 @@ use crate::sets::{Cache, Set};
 pub struct Render {
     /// A public set that was fetched: parts107, chairs or cars, into OUT/train, OUT/test (the same objects) and OUT/heldout.
     ///
-    /// Or meshes: .obj, .stl, .ply, .gltf, .glb, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The instance is called
+    /// Or meshes: .obj, .stl, .ply, .gltf, .glb, .ac, .acc, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The instance is called
     /// NAME, or like the file.
     #[arg(required = true, value_name = "SET|[NAME=]MESH", value_parser = subject)]
     what: Vec<Subject>,
@@ -299,11 +299,12 @@ pub fn read_mesh(path: &Path) -> Result<(Mesh, Up)> {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     Ok(match extension.as_str() {
         "dat" => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
+        "ac" | "acc" => (ac3d::load(path)?, Up::Y),
         "obj" => (obj::load(path)?, Up::Y),
         "gltf" | "glb" => (gltf::load(path)?, Up::Y),
         "stl" => (stl::load(path)?, Up::Z),
         "ply" => (ply::load(path)?, Up::Z),
-        _ => return Err(format!("{}: expected a .obj, .stl, .ply, .gltf, .glb or .dat mesh", path.display()).into()),
+        _ => return Err(format!("{}: expected a .obj, .stl, .ply, .gltf, .glb, .ac, .acc or .dat mesh", path.display()).into()),
     })
 }
 
