@@ -122,12 +122,14 @@ impl Cache {
         make_folder(&incoming)?;
         let name = package.name;
         let bar = bytes_progress(Some(release.bytes), &format!("downloading {name}"));
-        // What is half there, apt-get goes on with.
-        let (program, arguments, ending) = match package.client {
-            Client::Apt => ("apt-get", vec!["download".into(), format!("{name}={}", release.version)], "deb"),
-            Client::Npm => (NPM, vec!["pack".into(), "--loglevel=error".into(), format!("{name}@{}", release.version)], "tgz"),
+        let (program, ending, arguments, sign): (_, _, &[&str], _) = match package.client {
+            Client::Apt => ("apt-get", "deb", &["download"], "="),
+            // What npm's own cache has will do, since the sum is checked. By default it tries for minutes where there is no network.
+            Client::Npm => (NPM, "tgz", &["pack", "--loglevel=error", "--prefer-offline", "--fetch-retries=1"], "@"),
         };
-        ask(Command::new(program).args(arguments).current_dir(&incoming), Some((&incoming, &bar)))?;
+        let mut command = Command::new(program);
+        command.args(arguments).arg(format!("{name}{sign}{}", release.version)).current_dir(&incoming);
+        ask(&mut command, Some((&incoming, &bar))).map_err(|error| format!("{}: {error}", incoming.display()))?;
         bar.finish_and_clear();
         let is_it = |path: &PathBuf| path.extension().is_some_and(|extension| extension == ending);
         let files = fs::read_dir(&incoming).map_err(|error| about(&incoming, error))?.flatten().map(|entry| entry.path());
