@@ -162,6 +162,18 @@ pub fn progress(len: u64, what: &str) -> ProgressBar {
     bar
 }
 
+/// A bar on stderr that counts bytes; without a length, a counter that turns.
+pub fn bytes_progress(len: Option<u64>, what: &str) -> ProgressBar {
+    let template = match len {
+        Some(_) => format!("{what} {{bar:24}} {{bytes}}/{{total_bytes}} {{eta}} left"),
+        None => format!("{what} {{spinner}} {{bytes}}"),
+    };
+    let style = ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
+    let bar = len.map_or_else(ProgressBar::new_spinner, ProgressBar::new).with_style(style);
+    bar.enable_steady_tick(Duration::from_millis(200));
+    bar
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

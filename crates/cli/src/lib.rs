@@ -3,4 +3,6 @@
 pub mod common;
 pub mod data;
 pub mod pose;
+pub mod render;
+pub mod sets;
 pub mod train;

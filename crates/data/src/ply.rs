@@ -1,7 +1,7 @@
 //! PLY meshes, text and binary, with colours or a texture at the vertices, as BOP's models have them.
 
 use crate::error::{Error, Result, read_bytes};
-use crate::mesh::{Mesh, Part};
+use crate::mesh::{Mesh, Part, Textures, triangles_of};
 use glam::{Vec2, Vec3};
 use ply_rs_bw::parser::Parser;
 use ply_rs_bw::ply::{DefaultElement, Property};
@@ -37,13 +37,7 @@ pub fn load(path: &Path) -> Result<Mesh> {
     };
     let has_uv = vertices.first().and_then(uv).is_some();
     let picture = header.comments.iter().find_map(|comment| comment.trim().strip_prefix("TextureFile ")).filter(|_| has_uv);
-    if let Some(name) = picture {
-        match image::open(path.parent().unwrap_or(Path::new("")).join(name.trim().replace('\\', "/"))) {
-            Ok(picture) => mesh.textures.push(picture.into_rgba8()),
-            Err(error) => mesh.warnings.push(format!("{name}: {error}")),
-        }
-    }
-    let texture = (!mesh.textures.is_empty()).then_some(0);
+    let texture = picture.and_then(|name| Textures::beside(path).find(&mut mesh, name.trim()));
     let plain = if texture.is_some() { Vec3::ONE } else { Vec3::splat(0.6) };
     let mut left_out = 0;
     for face in elements("face") {
@@ -54,14 +48,12 @@ pub fn load(path: &Path) -> Result<Mesh> {
             left_out += 1;
             continue;
         };
-        for i in 1..found.len() - 1 {
-            let corners = [found[0], found[i], found[i + 1]];
-            let Some(positions) = corners.iter().map(|v| vector(v, ["x", "y", "z"])).collect::<Option<Vec<_>>>() else {
-                continue;
-            };
+        let positions: Option<Vec<_>> = found.iter().map(|v| vector(v, ["x", "y", "z"])).collect();
+        let Some(positions) = positions else { continue };
+        for corners in triangles_of(&positions) {
             let before = mesh.vertices.len();
-            mesh.push_flat([positions[0], positions[1], positions[2]], plain);
-            for (vertex, from) in mesh.vertices[before..].iter_mut().zip(corners) {
+            mesh.push_flat(corners.map(|i| positions[i]), plain);
+            for (vertex, from) in mesh.vertices[before..].iter_mut().zip(corners.map(|i| found[i])) {
                 vertex.normal = vector(from, ["nx", "ny", "nz"]).and_then(Vec3::try_normalize).unwrap_or(vertex.normal);
                 match texture {
                     Some(_) => vertex.uv = uv(from).unwrap_or_default(),

@@ -32,12 +32,17 @@ pub enum Choice {
 }
 
 impl Default for Choice {
-    /// Measured, and kept in `sigma-srn` of the user's cache directory: `$XDG_CACHE_HOME`, `%LOCALAPPDATA%` or `~/.cache`.
+    /// Measured, and kept in the user's cache directory, see [`cache_folder`].
     fn default() -> Self {
-        let set = |name| env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
-        let base = set("XDG_CACHE_HOME").or_else(|| set("LOCALAPPDATA")).or_else(|| Some(set("HOME")?.join(".cache")));
-        Choice::Measured { cache: base.map(|base| base.join("sigma-srn")) }
+        Choice::Measured { cache: cache_folder() }
     }
+}
+
+/// `sigma-srn` in the user's cache directory, `$XDG_CACHE_HOME`, `%LOCALAPPDATA%` or `~/.cache`; it need not exist.
+pub fn cache_folder() -> Option<PathBuf> {
+    let set = |name| env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let base = set("XDG_CACHE_HOME").or_else(|| set("LOCALAPPDATA")).or_else(|| Some(set("HOME")?.join(".cache")));
+    base.map(|base| base.join("sigma-srn"))
 }
 
 /// The choice, and what it has been so far.

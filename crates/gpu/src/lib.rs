@@ -15,7 +15,7 @@ mod pipeline;
 mod profile;
 pub mod raster;
 
-pub use choice::Choice;
+pub use choice::{Choice, cache_folder};
 pub use executor::GpuExecutor;
 pub use gpu::{AdapterInfo, Gpu, OpenError, adapters};
 pub use profile::KernelTime;
