@@ -297,6 +297,17 @@ impl Descent {
         Ok(standing.collect())
     }
 
+    /// Second derivatives of each hypothesis's loss at its best pose, over a turn about the object and a shift, in the camera's axes, as
+    /// BFGS knows them so far; nothing for Adam, nor before the first evaluation.
+    pub fn curvatures(&mut self) -> Result<Vec<[[f64; 6]; 6]>, Error> {
+        let Moves::Bfgs { state, .. } = self.handles.moves else { return Ok(vec![]) };
+        if !self.begun {
+            return Ok(vec![]);
+        }
+        let states = self.runner.read(state)?;
+        Ok(states.chunks_exact(bfgs::STATE as usize).map(bfgs::curvature).collect())
+    }
+
     /// Colours of the last evaluation `[hypotheses, rays, 3]`.
     pub fn rgb(&mut self) -> Result<Vec<f32>, Error> {
         Ok(self.runner.read(self.handles.network.rgb)?)

@@ -131,6 +131,8 @@ pub struct Estimate {
     pub pose: Pose6,
     /// Its loss.
     pub loss: f64,
+    /// Second derivatives of the loss there, over a turn about the object and a shift, in the camera's axes; with BFGS only.
+    pub curvature: Option<[[f64; 6]; 6]>,
     /// All starts, the winner first: more phases before fewer, then by loss.
     pub ranking: Vec<Ranked>,
 }
@@ -154,6 +156,7 @@ struct Hypothesis {
     start: usize,
     pose: Pose6,
     loss: f64,
+    curvature: Option<[[f64; 6]; 6]>,
     phases: usize,
 }
 
@@ -171,7 +174,10 @@ pub fn estimate(
     let mut step = 0;
     let mut hypotheses: Vec<Hypothesis> = Vec::new();
     for (query, q) in queries.iter().enumerate() {
-        let new = |(start, matrix)| Hypothesis { query, start, pose: Pose6::from_matrix(matrix), loss: f64::INFINITY, phases: 0 };
+        let new = |(start, matrix)| {
+            let pose = Pose6::from_matrix(matrix);
+            Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, phases: 0 }
+        };
         hypotheses.extend(q.starts.iter().enumerate().map(new));
     }
 
@@ -207,6 +213,8 @@ pub fn estimate(
             descent.evaluate()?;
         }
         observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
+        let curvatures = descent.curvatures()?;
+        running.iter_mut().zip(curvatures).for_each(|(hypothesis, curvature)| hypothesis.curvature = Some(curvature));
         for (hypothesis, standing) in running.iter_mut().zip(descent.standing()?) {
             (hypothesis.loss, hypothesis.pose) = standing;
             // A NaN must not win; something near the largest f32 is what a descent holds that never had another.
@@ -221,11 +229,11 @@ pub fn estimate(
 
     let mut estimates = Vec::new();
     for query in 0..queries.len() {
-        let own = hypotheses.iter().filter(|h| h.query == query);
-        let mut ranking: Vec<Ranked> =
-            own.map(|h| Ranked { start: h.start, loss: h.loss, phases: h.phases, pose: h.pose }).collect();
-        ranking.sort_by(|a, b| b.phases.cmp(&a.phases).then(a.loss.total_cmp(&b.loss)));
-        estimates.push(Estimate { pose: ranking[0].pose, loss: ranking[0].loss, ranking });
+        let mut own: Vec<&Hypothesis> = hypotheses.iter().filter(|h| h.query == query).collect();
+        own.sort_by(|a, b| b.phases.cmp(&a.phases).then(a.loss.total_cmp(&b.loss)));
+        let ranked = |h: &&Hypothesis| Ranked { start: h.start, loss: h.loss, phases: h.phases, pose: h.pose };
+        let &Hypothesis { pose, loss, curvature, .. } = own[0];
+        estimates.push(Estimate { pose, loss, curvature, ranking: own.iter().map(ranked).collect() });
     }
     Ok(estimates)
 }

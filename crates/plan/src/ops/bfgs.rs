@@ -15,6 +15,12 @@ pub const STATE_LOSS: usize = 27;
 /// Place of the best pose, 12 values.
 pub const STATE_POSE: usize = 28;
 
+/// The second derivatives in a state.
+pub fn curvature(state: &[f32]) -> [[f64; 6]; 6] {
+    let place = |a: usize, b: usize| a * (11 - a) / 2 + b;
+    std::array::from_fn(|a| std::array::from_fn(|b| state[place(a.min(b), a.max(b))].into()))
+}
+
 /// Rows per partial sum of [`equations`].
 const CHUNK_ROWS: u32 = 128;
 
