@@ -2,5 +2,6 @@
 
 pub mod common;
 pub mod data;
+mod meshes;
 pub mod pose;
 pub mod train;

@@ -21,6 +21,7 @@ pub mod ply;
 pub mod sheet;
 pub mod srn;
 pub mod stl;
+pub mod vrml;
 
 pub use camera::Camera;
 pub use capture::Capture;

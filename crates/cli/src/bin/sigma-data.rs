@@ -6,7 +6,7 @@ use sigma_cli::common::{Result, finish};
 use sigma_cli::data::{Export, Import, Inspect};
 use srn_data::mesh::{Mesh, Up};
 use srn_data::srn::{InstanceWriter, Intrinsics};
-use srn_data::{ac3d, camera, gltf, ldraw, obj, ply, stl};
+use srn_data::{camera, ldraw};
 use srn_gpu::raster::{self, Rasterizer};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -29,14 +29,14 @@ enum Command {
     Import(Import),
     /// Write a data set, or estimated poses, in another format, in the frame and the units that it was imported from.
     Export(Export),
-    /// Count, check and draw posed pictures. Exit status 1 if something is wrong with them.
+    /// Count, check and draw posed pictures, or read meshes. Exit status 1 if something is wrong with them.
     Inspect(Inspect),
 }
 
 #[derive(Args)]
 struct Render {
-    /// Meshes: .obj, .stl, .ply, .gltf, .glb, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The instance is called
-    /// NAME, or like the file.
+    /// Meshes: .obj, .stl, .ply, .gltf, .glb, .ac, .acc, .wrl, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The
+    /// instance is called NAME, or like the file.
     #[arg(required = true, value_name = "[NAME=]MESH", value_parser = named_mesh)]
     meshes: Vec<(String, PathBuf)>,
     /// The data set's folder; instances are made inside.
@@ -67,7 +67,7 @@ struct Render {
     /// Angle of view in degrees, instead of --focal.
     #[arg(long, value_parser = |x: &str| between(x, 0.0, 180.0))]
     fov: Option<f64>,
-    /// Which axis points up in the meshes. Default: y in .obj and glTF, z in .stl and .ply; LDraw has its own.
+    /// Which axis points up in the meshes. Default: y; z in .stl and .ply; LDraw has its own.
     #[arg(long, value_enum)]
     up: Option<MeshUp>,
     /// Replace instances that exist in the output folder.
@@ -181,16 +181,7 @@ fn named_mesh(argument: &str) -> std::result::Result<(String, PathBuf), String> 
 }
 
 fn load_mesh(path: &Path, up: Option<MeshUp>) -> Result<Mesh> {
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    let (mut mesh, usual) = match extension.as_str() {
-        "dat" => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
-        "ac" | "acc" => (ac3d::load(path)?, Up::Y),
-        "obj" => (obj::load(path)?, Up::Y),
-        "gltf" | "glb" => (gltf::load(path)?, Up::Y),
-        "stl" => (stl::load(path)?, Up::Z),
-        "ply" => (ply::load(path)?, Up::Z),
-        _ => return Err(format!("{}: expected a .obj, .stl, .ply, .gltf, .glb or .dat mesh", path.display()).into()),
-    };
+    let (mut mesh, usual) = srn_data::mesh::load(path)?;
     mesh.normalise(match (usual, up) {
         (Up::MinusY, _) | (_, None) => usual,
         (_, Some(MeshUp::Y)) => Up::Y,
