@@ -339,7 +339,7 @@ mod tests {
             ("mat 1", "mat 2", 1, "do not exist"),
             ("3 0 1\nkids", "4 0 1\nkids", 1, "do not exist"),
             ("my oak", "lost", 2, "lost.png"),
-            ("kids 2", "kids 4000000000", 2, "line 45: 3999999998 more objects were promised"),
+            ("kids 2", "kids 4000000000", 2, "line 49: 3999999998 more objects were promised"),
         ] {
             // A second object, so that something is there.
             let other = SQUARE.split_once("OBJECT poly\n").unwrap().1;
