@@ -2,6 +2,7 @@
 
 mod checks;
 mod demo;
+mod fuzz;
 mod new_op;
 mod setup;
 mod shell;
@@ -27,6 +28,12 @@ const COMMANDS: &[Command] = &[
         arguments: "DIR [--executor cpu64|cpu|gpu]",
         about: "every golden file of a folder on every executor",
         run: checks::golden,
+    },
+    Command {
+        name: "fuzz",
+        arguments: "[SECONDS [TARGET]]",
+        about: "read spoiled files with every reader, so long each",
+        run: fuzz::run,
     },
     Command {
         name: "bench",

@@ -12,13 +12,11 @@ use srn_data::inspect::{self, Origin};
 use srn_data::target::MARGIN;
 
 use crate::common::{Result, axes, named, progress};
+use crate::meshes;
 
 /// Flags that say what a source is, and how it differs from what its format promises.
 #[derive(Args, Debug)]
 struct Source {
-    /// SRN set or instance, transforms.json or its folder, BOP scene or folder of scenes, COLMAP model or its folder.
-    #[arg(value_name = "SRC")]
-    path: PathBuf,
     /// srn, transforms, bop or colmap; `auto` looks.
     #[arg(long, value_name = "FORMAT", default_value = "auto", value_parser = source_format)]
     format: SourceFormat,
@@ -84,10 +82,10 @@ fn up(text: &str) -> std::result::Result<UpAxis, String> {
 }
 
 impl Source {
-    fn read(&self) -> Result<(Format, Vec<Capture>)> {
+    fn read(&self, path: &Path) -> Result<(Format, Vec<Capture>)> {
         let format = match self.format.0 {
             Some(format) => format,
-            None => Format::detect(&self.path)?,
+            None => Format::detect(path)?,
         };
         let options = ReadOptions {
             axes: self.convention,
@@ -97,13 +95,16 @@ impl Source {
             images: self.images.clone(),
             object: self.object,
         };
-        Ok((format, formats::read(&self.path, format, &options)?))
+        Ok((format, formats::read(path, format, &options)?))
     }
 }
 
 /// Flags of `sigma-data import`.
 #[derive(Args, Debug)]
 pub struct Import {
+    /// SRN set or instance, transforms.json or its folder, BOP scene or folder of scenes, COLMAP model or its folder.
+    #[arg(value_name = "SRC")]
+    path: PathBuf,
     #[command(flatten)]
     source: Source,
     /// The data set's folder; instances are made inside.
@@ -144,7 +145,7 @@ pub struct Import {
 impl Import {
     /// Runs the command.
     pub fn run(&self) -> Result<bool> {
-        let (format, mut captures) = self.source.read()?;
+        let (format, mut captures) = self.source.read(&self.path)?;
         match (&self.name, &mut captures[..]) {
             (Some(name), [only]) => only.name = folder_name(name)?,
             (Some(_), several) => return Err(format!("--name: {} objects cannot have one name", several.len()).into()),
@@ -166,7 +167,7 @@ impl Import {
         for capture in &mut captures {
             bar.set_message(capture.name.clone());
             let (placed, found_by) = if keep { (DMat4::IDENTITY, "kept as it was".into()) } else { self.place(format, capture)? };
-            let root = std::fs::canonicalize(&self.source.path)?;
+            let root = std::fs::canonicalize(&self.path)?;
             let root = if root.is_file() { root.parent().unwrap_or(&root) } else { &root };
             let relative = |image: &Path| {
                 let image = std::fs::canonicalize(image).unwrap_or_else(|_| image.into());
@@ -379,6 +380,13 @@ fn read_estimates(path: &Path) -> Result<Vec<Estimate>> {
 /// Flags of `sigma-data inspect`.
 #[derive(Args, Debug)]
 pub struct Inspect {
+    /// SRN set or instance, transforms.json or its folder, BOP scene or folder of scenes, COLMAP model or its folder.
+    #[arg(value_name = "SRC", required_unless_present = "meshes")]
+    path: Option<PathBuf>,
+    /// Instead of posed pictures: mesh files, and folders of them. Reads each, says what is in it and what was left out. Exit
+    /// status 1 if a file was refused.
+    #[arg(long, value_name = "PATH", num_args = 1.., conflicts_with_all = ["path", "Source", "out", "force"])]
+    meshes: Vec<PathBuf>,
     #[command(flatten)]
     source: Source,
     /// Print the findings as JSON.
@@ -395,8 +403,9 @@ pub struct Inspect {
 impl Inspect {
     /// Runs the command; false where something is wrong.
     pub fn run(&self) -> Result<bool> {
+        let Some(path) = &self.path else { return meshes::inspect(&self.meshes, self.json) };
         refuse_existing(self.out.iter().cloned(), self.force)?;
-        let (format, mut captures) = self.source.read()?;
+        let (format, mut captures) = self.source.read(path)?;
         let origin = if format == Format::Srn { Origin::Given } else { Origin::Found };
         if origin == Origin::Found {
             inspect::place_all(&mut captures, format.up())?;

@@ -2,6 +2,7 @@
 
 pub mod common;
 pub mod data;
+mod meshes;
 pub mod pose;
 pub mod render;
 pub mod sets;

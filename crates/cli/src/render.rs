@@ -7,9 +7,9 @@ use clap::{Args, ValueEnum};
 use glam::{DMat4, DVec3};
 use image::RgbImage;
 use indicatif::ProgressBar;
-use srn_data::mesh::{Mesh, Up};
+use srn_data::mesh::{self, Mesh, Up};
 use srn_data::srn::{InstanceWriter, Intrinsics};
-use srn_data::{ac3d, camera, gltf, ldraw, obj, ply, sheet, stl};
+use srn_data::{camera, ldraw, sheet};
 use srn_gpu::raster::{self, Rasterizer};
 
 use crate::common::{Result, progress};
@@ -20,8 +20,8 @@ use crate::sets::{Cache, Set};
 pub struct Render {
     /// A public set that was fetched: parts107, chairs or cars, into OUT/train, OUT/test (the same objects) and OUT/heldout.
     ///
-    /// Or meshes: .obj, .stl, .ply, .gltf, .glb, .ac, .acc, or LDraw .dat inside a library (parts/, p/, LDConfig.ldr). The instance is called
-    /// NAME, or like the file.
+    /// Or meshes: .obj, .stl, .ply, .gltf, .glb, .ac, .acc, .wrl, or LDraw .dat inside a library (parts/, p/,
+    /// LDConfig.ldr). The instance is called NAME, or like the file.
     #[arg(required = true, value_name = "SET|[NAME=]MESH", value_parser = subject)]
     what: Vec<Subject>,
     /// The data set's folder; instances are made inside.
@@ -56,7 +56,7 @@ pub struct Render {
     /// Angle of view in degrees, instead of --focal.
     #[arg(long, value_parser = |x: &str| between(x, 0.0, 180.0))]
     fov: Option<f64>,
-    /// Which axis points up in the meshes. Default: y in .obj and glTF, z in .stl and .ply; LDraw and sets have their own.
+    /// Which axis points up in the meshes. Default: y; z in .stl and .ply; LDraw and sets have their own.
     #[arg(long, value_enum)]
     up: Option<MeshUp>,
     /// Where the packages of sets are kept. Default: as `sigma-data fetch`.
@@ -181,7 +181,7 @@ impl Render {
         let studio = self.studio(set.radius(), pictures)?;
         let (mut counts, mut skipped, mut cells) = ([0; 2], 0, vec![]);
         for (path, folders, object) in &jobs {
-            match read_mesh(path) {
+            match mesh::load(path) {
                 Ok((mut mesh, _)) => {
                     mesh.normalise(object.turn);
                     studio.warn(&object.name, &mesh);
@@ -294,22 +294,8 @@ fn subject(argument: &str) -> std::result::Result<Subject, String> {
     }
 }
 
-/// Reads a mesh of any format. Returns it in the file's own axes, and which of them usually points up.
-pub fn read_mesh(path: &Path) -> Result<(Mesh, Up)> {
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    Ok(match extension.as_str() {
-        "dat" => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
-        "ac" | "acc" => (ac3d::load(path)?, Up::Y),
-        "obj" => (obj::load(path)?, Up::Y),
-        "gltf" | "glb" => (gltf::load(path)?, Up::Y),
-        "stl" => (stl::load(path)?, Up::Z),
-        "ply" => (ply::load(path)?, Up::Z),
-        _ => return Err(format!("{}: expected a .obj, .stl, .ply, .gltf, .glb, .ac, .acc or .dat mesh", path.display()).into()),
-    })
-}
-
 fn load_mesh(path: &Path, up: Option<MeshUp>) -> Result<Mesh> {
-    let (mut mesh, usual) = read_mesh(path)?;
+    let (mut mesh, usual) = mesh::load(path)?;
     mesh.normalise(match (usual, up) {
         (Up::MinusY, _) | (_, None) => usual,
         (_, Some(MeshUp::Y)) => Up::Y,
@@ -319,14 +305,14 @@ fn load_mesh(path: &Path, up: Option<MeshUp>) -> Result<Mesh> {
 }
 
 fn upload(rasterizer: &Rasterizer, mesh: &Mesh) -> Result<raster::Model> {
-    let vertex = |v: &srn_data::mesh::Vertex| raster::Vertex {
+    let vertex = |v: &mesh::Vertex| raster::Vertex {
         position: v.position.to_array(),
         normal: v.normal.to_array(),
         colour: v.colour.to_array(),
         uv: v.uv.to_array(),
     };
     let vertices: Vec<_> = mesh.vertices.iter().map(vertex).collect();
-    let part = |part: &srn_data::mesh::Part| (part.vertices.start as u32..part.vertices.end as u32, part.texture);
+    let part = |part: &mesh::Part| (part.vertices.start as u32..part.vertices.end as u32, part.texture);
     let parts: Vec<_> = mesh.parts.iter().map(part).collect();
     let textures = mesh.textures.iter().map(|t| raster::Texture { width: t.width(), height: t.height(), rgba: t.as_raw() });
     let textures: Vec<_> = textures.collect();

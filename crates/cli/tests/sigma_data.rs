@@ -271,3 +271,52 @@ fn the_doctor_says_what_to_try() {
         assert!(!out.exists(), "{flags:?}: wrote something");
     }
 }
+
+#[test]
+fn meshes_are_read_and_counted() {
+    let dir = tempfile::tempdir().unwrap();
+    let good = sigma_data(&["inspect", "--meshes", &format!("{ASSETS}/meshes"), "--json"]);
+    assert_eq!(good.status.code(), Some(0), "{}", stderr(&good));
+    let report: serde_json::Value = serde_json::from_slice(&good.stdout).unwrap();
+    // Of the LDraw library the parts only, not the pieces that they are made of.
+    let files = report["files"].as_array().unwrap();
+    assert!(files.iter().all(|file| !file["path"].as_str().unwrap().contains("/p/")), "{report}");
+    assert_eq!((report["formats"]["obj"]["read"].as_u64(), report["formats"]["dat"]["refused"].as_u64()), (Some(2), Some(0)));
+    let chicken = files.iter().find(|file| file["path"].as_str().unwrap().ends_with("chicken.obj")).unwrap();
+    assert!(chicken["triangles"].as_u64() > Some(100) && chicken["textures"].as_u64() == Some(1), "{chicken}");
+    assert!(chicken["high"][1].as_f64() > chicken["low"][1].as_f64());
+
+    let triangle = "v 0 0 0\nv 2 0 0\nv 0 3 0\nf 1 2 3\n";
+    for (name, text) in [
+        ("a.obj", triangle),
+        ("b.obj", &format!("{triangle}f 1 2 4\n")),
+        ("c.OBJ", "v 0 0 0\n"),
+        ("d.ac", "AC3Db\nx\n"),
+        ("e.dat", "?"),
+    ] {
+        fs::write(dir.path().join(name), text).unwrap();
+    }
+    let path = dir.path().to_str().unwrap();
+    let mixed = sigma_data(&["inspect", "--meshes", path, &format!("{path}/none.stl")]);
+    let said = String::from_utf8_lossy(&mixed.stdout).into_owned();
+    assert_eq!(mixed.status.code(), Some(1), "{}", stderr(&mixed));
+    let line = |words: &str| said.lines().find(|line| line.contains(words)).unwrap_or_else(|| panic!("{words}: {said}"));
+    assert_eq!(line("a.obj").split_whitespace().take(9).collect::<Vec<_>>().join(" "), "1 1 0 2.0000 × 3.0000 × 0.0000 0");
+    assert!(line("b.obj").contains("line 5: face left out"));
+    assert!(line("refused").contains("c.OBJ: faces: expected at least one"));
+    assert_eq!(line("obj  ").split_whitespace().collect::<Vec<_>>(), ["obj", "3", "1", "1", "1"]);
+    assert_eq!(line("refused 1: expected MATERIAL").trim(), "refused 1: expected MATERIAL or OBJECT, found \"x\"");
+    assert!(line("none.stl").contains("refused") && !said.contains("e.dat"));
+
+    for bad in [
+        &["inspect"][..],
+        &["inspect", "--meshes"],
+        &["inspect", path, "--meshes", path],
+        &["inspect", "--meshes", path, "--fov", "9"],
+    ] {
+        assert_eq!(sigma_data(bad).status.code(), Some(2), "{bad:?}");
+    }
+    let empty = tempfile::tempdir().unwrap();
+    let none = sigma_data(&["inspect", "--meshes", empty.path().to_str().unwrap()]);
+    assert!(none.status.code() == Some(2) && stderr(&none).contains("no .obj"), "{}", stderr(&none));
+}

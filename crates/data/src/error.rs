@@ -1,3 +1,4 @@
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// What can go wrong with a file. Every message names the file and, where there is one, the field with what was found and
@@ -94,5 +95,8 @@ pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
     if length > LONGEST_TEXT {
         return Err(Error::field(path, "length", format!("at most {LONGEST_TEXT} bytes"), length));
     }
-    std::fs::read(path).at(path)
+    // What has no length, as a device, may have no end.
+    let mut bytes = vec![];
+    std::fs::File::open(path).and_then(|file| file.take(LONGEST_TEXT).read_to_end(&mut bytes)).at(path)?;
+    Ok(bytes)
 }

@@ -18,6 +18,8 @@ struct Reader<'a> {
     path: &'a Path,
     buffers: Vec<gltf::buffer::Data>,
     mesh: Mesh,
+    /// Nodes that were drawn: each stands in one place only.
+    nodes: usize,
     /// By number of the image; `None` where it cannot be read.
     textures: HashMap<usize, Option<usize>>,
 }
@@ -30,11 +32,12 @@ pub fn load(path: &Path) -> Result<Mesh> {
     check_attributes(path, &bytes)?;
     let gltf::Gltf { document, blob } = gltf::Gltf::from_slice(&bytes).map_err(refused)?;
     let buffers = gltf::import_buffers(&document, path.parent(), blob).map_err(refused)?;
-    let mut reader = Reader { path, buffers, mesh: Mesh::default(), textures: HashMap::new() };
+    let mut reader = Reader { path, buffers, mesh: Mesh::default(), nodes: 0, textures: HashMap::new() };
     let scene = document.default_scene().or_else(|| document.scenes().next());
+    let all = document.nodes().count();
     match scene {
-        Some(scene) => scene.nodes().try_for_each(|node| reader.node(&node, Mat4::IDENTITY, 0))?,
-        None => document.nodes().try_for_each(|node| reader.node(&node, Mat4::IDENTITY, DEEPEST))?,
+        Some(scene) => scene.nodes().try_for_each(|node| reader.node(&node, Mat4::IDENTITY, 0, all))?,
+        None => document.nodes().try_for_each(|node| reader.node(&node, Mat4::IDENTITY, DEEPEST, all))?,
     }
     reader.mesh.with_faces(path)
 }
@@ -52,14 +55,19 @@ fn check_attributes(path: &Path, bytes: &[u8]) -> Result<()> {
 }
 
 impl Reader<'_> {
-    fn node(&mut self, node: &gltf::Node, parent: Mat4, depth: usize) -> Result<()> {
+    fn node(&mut self, node: &gltf::Node, parent: Mat4, depth: usize, all: usize) -> Result<()> {
+        self.nodes += 1;
+        if self.nodes > all {
+            return Err(Error::field(self.path, "nodes", format!("each of {all} in one place"), "one in several"));
+        }
         let placed = parent * Mat4::from_cols_array_2d(&node.transform().matrix());
         for primitive in node.mesh().iter().flat_map(|mesh| mesh.primitives()) {
             self.primitive(&primitive, placed);
+            self.mesh.check_size(self.path)?;
         }
         // Without scenes the nodes stand side by side already.
         if depth < DEEPEST {
-            node.children().try_for_each(|child| self.node(&child, placed, depth + 1))?;
+            node.children().try_for_each(|child| self.node(&child, placed, depth + 1, all))?;
         } else if depth > DEEPEST {
             return Err(Error::field(self.path, "nodes", format!("at most {DEEPEST} inside each other"), depth));
         }

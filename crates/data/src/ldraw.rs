@@ -3,7 +3,7 @@
 //! A line of type 1 places a sub-file, 3 is a triangle, 4 a quadrilateral; others carry no surface. Colour 16 inherits from
 //! the file above, 24 is its edge colour. The y axis points down.
 
-use crate::error::{At, Error, Result};
+use crate::error::{Error, Result, read_bytes};
 use crate::mesh::{Mesh, Part};
 use glam::{Affine3A, Mat3, Vec3};
 use std::collections::HashMap;
@@ -24,6 +24,9 @@ pub const MAIN_COLOURS: [(u32, &str); 10] = [
     (70, "Reddish_Brown"),
 ];
 
+/// No part places more sub-files, those of its sub-files included; real ones place some thousand.
+const MOST_FILES: usize = 1 << 17;
+
 /// A surface colour and the colour of its edges, RGB in [0, 1].
 type Pair = [Vec3; 2];
 
@@ -41,7 +44,7 @@ impl Library {
         let why = || "an LDraw part lies in parts/ of a library, beside p/ and LDConfig.ldr".into();
         let root = root.ok_or_else(|| Error::Missing { path: part.with_file_name("LDConfig.ldr"), why: why() })?;
         let path = root.join("LDConfig.ldr");
-        let text = String::from_utf8_lossy(&std::fs::read(&path).at(&path)?).into_owned();
+        let text = String::from_utf8_lossy(&read_bytes(&path)?).into_owned();
         Ok(Self { root: root.into(), colours: text.lines().filter_map(colour_definition).collect() })
     }
 
@@ -54,16 +57,27 @@ impl Library {
         let colour = self.colours.get(&code).copied();
         let colour =
             colour.ok_or_else(|| Error::field(&self.root.join("LDConfig.ldr"), "!COLOUR", format!("code {code}"), "none"))?;
-        self.append(&mut mesh, part, Affine3A::IDENTITY, colour, 0)?;
-        if mesh.vertices.is_empty() {
-            return Err(Error::field(part, "surfaces", "at least one triangle", "none"));
-        }
+        self.append(&mut mesh, part, Affine3A::IDENTITY, colour, 0, &mut 0)?;
         mesh.parts = vec![Part { vertices: 0..mesh.vertices.len(), texture: None }];
-        Ok(mesh)
+        mesh.with_faces(part)
     }
 
-    fn append(&self, mesh: &mut Mesh, path: &Path, placed: Affine3A, colour: Pair, depth: usize) -> Result<()> {
-        let text = String::from_utf8_lossy(&std::fs::read(path).at(path)?).into_owned();
+    fn append(
+        &self,
+        mesh: &mut Mesh,
+        path: &Path,
+        placed: Affine3A,
+        colour: Pair,
+        depth: usize,
+        files: &mut usize,
+    ) -> Result<()> {
+        // Files that hold each other twice, and so on, would take for ever.
+        *files += 1;
+        if *files > MOST_FILES {
+            return Err(Error::field(path, "sub-files", format!("at most {MOST_FILES}"), "more"));
+        }
+        mesh.check_size(path)?;
+        let text = String::from_utf8_lossy(&read_bytes(path)?).into_owned();
         for (number, line) in text.lines().enumerate() {
             let words: Vec<_> = line.split_whitespace().collect();
             let bad = |expected| Error::field(path, format!("line {}", number + 1), expected, format!("\"{line}\""));
@@ -92,7 +106,7 @@ impl Library {
                 if depth > 50 {
                     return Err(bad("at most 50 nested files"));
                 }
-                self.append(mesh, &file, placed * here, own, depth + 1)?;
+                self.append(mesh, &file, placed * here, own, depth + 1, files)?;
             } else {
                 let n = if kind == "3" { 3 } else { 4 };
                 let values = floats(3 * n)?;
@@ -193,7 +207,7 @@ mod tests {
             ("3 16 0 0 0 1 0 0 0 1", "line 1"),
             ("3 16 0 0 0 1 0 0 0 1 x", "line 1"),
             ("0 fine\n3 99 0 0 0 1 0 0 0 1 0", "line 2"),
-            ("0 nothing here", "triangle"),
+            ("0 nothing here", "faces"),
         ];
         for (part, word) in cases {
             let error = load(part, 4).unwrap_err().to_string();

@@ -22,6 +22,7 @@ pub mod sheet;
 pub mod srn;
 pub mod stl;
 pub mod target;
+pub mod vrml;
 
 pub use camera::Camera;
 pub use capture::Capture;

@@ -1,6 +1,7 @@
 //! Triangles with colours and textures, ready to be drawn.
 
 use crate::error::{At, Error, Result, read_bytes};
+use crate::{ac3d, gltf, ldraw, obj, ply, stl, vrml};
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use image::{DynamicImage, ImageDecoder, ImageReader, Limits, RgbaImage};
 use image_extras::sgi::SgiDecoder;
@@ -66,6 +67,27 @@ impl From<Up> for Mat3 {
     }
 }
 
+/// Endings of the files that [`load`] reads, in lower case.
+pub const ENDINGS: [&str; 9] = ["obj", "stl", "ply", "gltf", "glb", "ac", "acc", "wrl", "dat"];
+
+/// Files in which a part can be placed many times may describe more triangles than fit into memory.
+const MOST_TRIANGLES: usize = 1 << 23;
+
+/// Reads a mesh of any format, in the file's own axes and units. Returns with it which axis usually points up in such files.
+pub fn load(path: &Path) -> Result<(Mesh, Up)> {
+    let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    Ok(match ending.as_str() {
+        "dat" => (ldraw::Library::of_part(path)?.load(path, None)?, Up::MinusY),
+        "ac" | "acc" => (ac3d::load(path)?, Up::Y),
+        "obj" => (obj::load(path)?, Up::Y),
+        "gltf" | "glb" => (gltf::load(path)?, Up::Y),
+        "wrl" => (vrml::load(path)?, Up::Y),
+        "stl" => (stl::load(path)?, Up::Z),
+        "ply" => (ply::load(path)?, Up::Z),
+        _ => return Err(Error::field(path, "ending", format!("one of .{}", ENDINGS.join(", .")), format!("\".{ending}\""))),
+    })
+}
+
 impl Mesh {
     /// Adds a triangle with a flat normal to the last part. Degenerate triangles are dropped.
     pub(crate) fn push_flat(&mut self, corners: [Vec3; 3], colour: Vec3) {
@@ -75,9 +97,20 @@ impl Mesh {
         }
     }
 
-    /// The mesh, if it has a triangle.
-    pub(crate) fn with_faces(self, path: &Path) -> Result<Self> {
+    /// The mesh, if it has a triangle. Texture coordinates and colours that are no numbers become 0, as positions were seen to
+    /// be numbers before.
+    pub(crate) fn with_faces(mut self, path: &Path) -> Result<Self> {
+        for vertex in &mut self.vertices {
+            vertex.uv = if vertex.uv.is_finite() { vertex.uv } else { Vec2::ZERO };
+            vertex.colour = if vertex.colour.is_finite() { vertex.colour } else { Vec3::ZERO };
+        }
         if self.vertices.is_empty() { Err(Error::field(path, "faces", "at least one", "none")) } else { Ok(self) }
+    }
+
+    /// An error where the mesh has grown beyond all measure.
+    pub(crate) fn check_size(&self, path: &Path) -> Result<()> {
+        let expected = || format!("at most {MOST_TRIANGLES} triangles");
+        if self.vertices.len() > 3 * MOST_TRIANGLES { Err(Error::field(path, "faces", expected(), "more")) } else { Ok(()) }
     }
 
     /// The corners of the bounding box.

@@ -1,6 +1,6 @@
 //! Wavefront OBJ with MTL materials and textures.
 
-use crate::error::{At, Error, Result};
+use crate::error::{Error, Result, read_bytes};
 use crate::mesh::{Mesh, Part, Textures};
 use glam::{Vec2, Vec3};
 use std::path::Path;
@@ -9,19 +9,19 @@ use std::path::Path;
 /// read are left out and named in [`Mesh::warnings`]; a file without any face is an error. Normals are kept where the file has
 /// them, else flat; a textured surface takes its colour from the texture alone.
 pub fn load(path: &Path) -> Result<Mesh> {
-    let text = String::from_utf8_lossy(&std::fs::read(path).at(path)?).into_owned();
+    let text = String::from_utf8_lossy(&read_bytes(path)?).into_owned();
     let mut mesh = Mesh::default();
     let text = tidy(&text, &mut mesh.warnings);
     let folder = path.parent().unwrap_or(Path::new(""));
     let material_warnings = std::cell::RefCell::new(vec![]);
     let options = tobj::LoadOptions { single_index: false, triangulate: true, ignore_points: true, ignore_lines: true };
     let (models, materials) = tobj::load_obj_buf(&mut text.as_bytes(), &options, |name| {
-        let loaded = std::fs::read(folder.join(name)).map_err(|e| e.to_string());
-        let loaded = loaded.and_then(|bytes| tobj::load_mtl_buf(&mut bytes.as_slice()).map_err(|e| e.to_string()));
-        Ok(loaded.unwrap_or_else(|error| {
-            material_warnings.borrow_mut().push(format!("{}: {error}", name.display()));
-            Default::default()
-        }))
+        let mut warnings = material_warnings.borrow_mut();
+        let bytes =
+            read_bytes(&folder.join(name)).map_err(|error| warnings.push(format!("materials {error}"))).unwrap_or_default();
+        let found = materials(&String::from_utf8_lossy(&bytes), |what| warnings.push(format!("{}: {what}", name.display())));
+        let numbers = found.iter().enumerate().map(|(number, material)| (material.name.clone(), number)).collect();
+        Ok((found, numbers))
     })
     .map_err(|error| Error::field(path, "OBJ", "a Wavefront OBJ file", error))?;
     let materials = materials.unwrap_or_default();
@@ -86,6 +86,28 @@ fn tidy(text: &str, warnings: &mut Vec<String>) -> String {
     vertices + &rest
 }
 
+/// The names, colours and textures of an MTL file. tobj's own reader gives up a whole file for one line that it cannot read, or
+/// panics.
+fn materials(text: &str, mut warn: impl FnMut(String)) -> Vec<tobj::Material> {
+    let mut found: Vec<tobj::Material> = vec![];
+    for (number, line) in text.lines().enumerate() {
+        let (key, rest) = line.trim().split_once(char::is_whitespace).unwrap_or((line.trim(), ""));
+        match (key, found.last_mut()) {
+            ("newmtl", _) => found.push(tobj::Material { name: rest.trim().into(), ..Default::default() }),
+            ("Kd", Some(material)) => {
+                let colour: Option<Vec<f32>> = rest.split_whitespace().take(3).map(|word| word.parse().ok()).collect();
+                material.diffuse = colour.and_then(|colour| colour.try_into().ok());
+                if material.diffuse.is_none() {
+                    warn(format!("line {}: expected a colour: {}", number + 1, line.trim()));
+                }
+            }
+            ("map_Kd", Some(material)) => material.diffuse_texture = Some(rest.trim().into()),
+            _ => {}
+        }
+    }
+    found
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -142,10 +164,12 @@ mod tests {
         let mesh = loaded(&OBJ.replace("my things", "lost")).unwrap();
         assert!(mesh.vertices.len() == 12 && mesh.warnings[0].contains("lost.mtl"), "{:?}", mesh.warnings);
         let dir = tempfile::tempdir().unwrap();
-        write(dir.path().join("my things.mtl"), MTL).unwrap();
+        // A colour of one number: found by the fuzzer.
+        write(dir.path().join("my things.mtl"), MTL.replace("1 0.25 0", "1").replace("newmtl", "Ns x\nnewmtl")).unwrap();
         write(dir.path().join("mesh.obj"), OBJ).unwrap();
         let mesh = load(&dir.path().join("mesh.obj")).unwrap();
-        assert!(mesh.textures.is_empty() && mesh.warnings[0].contains("old oak.png"), "{:?}", mesh.warnings);
+        assert!(mesh.warnings[0].contains("my things.mtl: line 3: expected a colour: Kd 1"), "{:?}", mesh.warnings);
+        assert!(mesh.textures.is_empty() && mesh.warnings[1].contains("old oak.png"), "{:?}", mesh.warnings);
         assert_eq!(mesh.vertices[6].colour, Vec3::splat(0.1), "without its texture a surface has its own colour");
     }
 }

@@ -16,6 +16,8 @@ use std::path::{Path, PathBuf};
 
 /// The largest rigid error of a pose that is still read (poses in six decimals, or stored as f32, lie far below).
 pub const RIGID_TOLERANCE: f64 = 1e-3;
+/// Places and intrinsics beyond this are no measurements, and the network's single precision could not work with them.
+const LARGEST: f64 = 1e12;
 
 /// A data set on disk: names and files; pictures are read by [`SrnSet::load`].
 #[derive(Debug, Clone)]
@@ -215,7 +217,8 @@ pub fn read_poses(path: &Path) -> Result<Vec<DMat4>> {
 /// Refuses what is no rigid motion.
 pub(crate) fn rigid(path: &Path, field: &str, pose: DMat4) -> Result<DMat4> {
     match rigid_error(&pose) {
-        error if error <= RIGID_TOLERANCE => Ok(pose),
+        error if error <= RIGID_TOLERANCE && pose.w_axis.abs().max_element() <= LARGEST => Ok(pose),
+        error if error <= RIGID_TOLERANCE => Err(Error::field(path, field, format!("a place within {LARGEST:e}"), pose.w_axis)),
         error if error >= 2.0 => Err(Error::field(path, field, "a right-handed rotation", "a mirrored or scaled one")),
         error => Err(Error::field(path, field, format!("a rigid motion within {RIGID_TOLERANCE}"), format!("{error:.3} off"))),
     }
@@ -278,6 +281,9 @@ impl Intrinsics {
             let flag = lines.get(4).is_some_and(|line| line.trim().parse() == Ok(1.0));
             (Self { focal: [camera[0]; 2], centre: [camera[1], camera[2]], size }, flag)
         };
+        if let Some(pixels) = intrinsics.centre.into_iter().chain(intrinsics.focal).find(|pixels| pixels.abs() > LARGEST) {
+            return Err(Error::field(path, "f cx cy", format!("at most {LARGEST:e} pixels"), format!("{pixels:e}")));
+        }
         if let Some(focal) = intrinsics.focal.into_iter().find(|&focal| focal <= 0.0) {
             return Err(Error::field(path, "f", "a positive focal length", focal));
         }
@@ -502,6 +508,9 @@ mod tests {
         broken("pose/000001.txt", remove, &["missing", "rgb"]);
         broken("rgb/000001.png", remove, &["missing", "pose"]);
         broken("intrinsics.txt", remove, &[]);
+        // What single precision cannot hold: found by the fuzzer.
+        broken("intrinsics.txt", text("74.4 -1e308 4. 0.\n0. 0. 0.\n1.\n8 8\n"), &["f cx cy", "-1e308"]);
+        broken("pose/000000.txt", text("1 0 0 0 0 1 0 0 0 0 1 1e99 0 0 0 1"), &["a place within 1e12"]);
         broken("rgb/000002.png", halve, &["not a readable image"]);
         broken("rgb/000002.png", text("no picture"), &["not a readable image"]);
         broken("pose/000000.txt", text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0"), &["16 numbers", "15"]);

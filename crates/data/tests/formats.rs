@@ -12,7 +12,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 mod spoil;
-use spoil::{config, spoiled};
+use spoil::{fuzz, one_spoiled, spoiled};
 
 const BOX: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/box");
 /// Length of the box's diagonal in metres.
@@ -569,25 +569,73 @@ fn survive(format: Format, path: &Path) -> Result<(), TestCaseError> {
     Ok(())
 }
 
-#[test]
-fn no_file_makes_a_reader_panic_or_pass_on_a_wrong_pose() {
+/// Reads a source while any of its files, in turn, is not as it should be.
+fn survive_all(target: &str, format: Format) {
     let dir = tempfile::tempdir().unwrap();
-    for (format, path, files) in sources(dir.path()) {
-        for file in &files {
-            let good = fs::read(file).unwrap();
-            let found = proptest::test_runner::TestRunner::new(config(96)).run(&spoiled(), |spoiled| {
-                fs::write(file, spoiled.of(&good)).unwrap();
-                survive(format, &path)
-            });
-            fs::write(file, good).unwrap();
-            assert!(found.is_ok(), "{}: {}", file.display(), found.unwrap_err());
+    let (_, path, files) = sources(dir.path()).into_iter().find(|(found, ..)| *found == format).unwrap();
+    let good: Vec<_> = files.iter().map(|file| fs::read(file).unwrap()).collect();
+    fuzz(target, 200, &one_spoiled(files.len()), |(which, spoiled)| {
+        for (k, (file, good)) in files.iter().zip(&good).enumerate() {
+            let bytes = if k == which { spoiled.of(good) } else { good.clone() };
+            fs::write(file, bytes).unwrap();
         }
-        assert!(formats::read(&path, format, &ReadOptions::default()).is_ok(), "the source is in order again");
-    }
+        survive(format, &path)
+    });
+    files.iter().zip(good).for_each(|(file, good)| fs::write(file, good).unwrap());
+    assert!(formats::read(&path, format, &ReadOptions::default()).is_ok(), "the source is in order again");
 }
 
 #[test]
-fn results_and_models_survive_anything() {
+fn fuzz_srn() {
+    survive_all("srn", Format::Srn);
+}
+
+#[test]
+fn fuzz_transforms() {
+    survive_all("transforms", Format::Transforms);
+}
+
+#[test]
+fn fuzz_bop() {
+    survive_all("bop", Format::Bop);
+}
+
+#[test]
+fn fuzz_colmap() {
+    survive_all("colmap", Format::Colmap);
+}
+
+#[test]
+fn fuzz_colmap_text() {
+    survive_all("colmap-text", Format::ColmapText);
+}
+
+/// The way of training and estimation: poses and intrinsics as they are, without a capture.
+#[test]
+fn fuzz_srn_set() {
+    let dir = tempfile::tempdir().unwrap();
+    let capture = made(dir.path(), "thing", 2, |_| Camera { intrinsics: [20.0, 20.0, 8.0, 8.0], size: [16; 2], ..PINHOLE });
+    let set = dir.path().join("set");
+    let instance = written(&capture, Format::Srn, &set);
+    let files = ["pose/000001.txt", "intrinsics.txt", "rgb/000001.png"].map(|file| instance.join(file));
+    let good = files.each_ref().map(|file| fs::read(file).unwrap());
+    fuzz("srn-set", 400, &one_spoiled(files.len()), |(which, spoiled)| {
+        for (k, (file, good)) in files.iter().zip(&good).enumerate() {
+            let bytes = if k == which { spoiled.of(good) } else { good.clone() };
+            fs::write(file, bytes).unwrap();
+        }
+        let read = SrnSet::open(&set).and_then(|set| set.load(16));
+        for view in read.iter().flat_map(|set| &set.instances).flat_map(|instance| &instance.views) {
+            let pose = DMat4::from_cols_array(&view.world_from_camera).transpose();
+            prop_assert!(rigid_error(&pose) <= 2e-3 && view.intrinsics.iter().all(|x| x.is_finite()), "{pose}");
+        }
+        prop_assert!(read.err().is_none_or(|error| !error.to_string().contains('\n')));
+        Ok(())
+    });
+}
+
+#[test]
+fn fuzz_bop_tables() {
     let dir = tempfile::tempdir().unwrap();
     let (results, models) = (dir.path().join("results.csv"), dir.path().join("models_info.json"));
     let estimate = bop::Estimate {
@@ -599,23 +647,23 @@ fn results_and_models_survive_anything() {
         time: -1.0,
     };
     bop::write_results(&results, &[estimate], false).unwrap();
-    let good = [
-        fs::read(&results).unwrap(),
-        br#"{"5": {"min_x": -10, "min_y": -20, "min_z": 0, "size_x": 20, "size_y": 40, "size_z": 40,
-            "symmetries_discrete": [[-1,0,0,4, 0,-1,0,0, 0,0,1,0, 0,0,0,1]]}}"#
-            .to_vec(),
-    ];
-    proptest!(config(500), |(spoiled in spoiled())| {
-        for (path, good) in [&results, &models].into_iter().zip(&good) {
-            fs::write(path, spoiled.of(good)).unwrap();
-        }
+    let table = fs::read(&results).unwrap();
+    fuzz("bop-results", 400, &spoiled(), |spoiled| {
+        fs::write(&results, spoiled.of(&table)).unwrap();
         for estimate in bop::read_results(&results).unwrap_or_default() {
             prop_assert!(rigid_error(&estimate.camera_from_object) <= 1e-3);
         }
+        Ok(())
+    });
+    let info = br#"{"5": {"min_x": -10, "min_y": -20, "min_z": 0, "size_x": 20, "size_y": 40, "size_z": 40,
+        "symmetries_discrete": [[-1,0,0,4, 0,-1,0,0, 0,0,1,0, 0,0,0,1]]}}"#;
+    fuzz("bop-models", 400, &spoiled(), |spoiled| {
+        fs::write(&models, spoiled.of(info)).unwrap();
         for info in bop::read_models_info(&models).unwrap_or_default().into_values() {
             prop_assert!(info.bounds.is_none_or(|b| b.diagonal > 0.0 && b.centre.is_finite()));
             prop_assert!(info.discrete.iter().all(|motion| rigid_error(motion) <= 1e-3));
         }
+        Ok(())
     });
 }
 

@@ -1,13 +1,11 @@
 //! Mesh files that are not as they should be.
 
 use proptest::prelude::*;
-use srn_data::mesh::{Mesh, Up};
-use srn_data::{Result, gltf, obj, ply, stl};
+use srn_data::mesh;
 use std::fs;
-use std::path::Path;
 
 mod spoil;
-use spoil::{config, spoiled};
+use spoil::{fuzz, one_spoiled};
 
 const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\n\
     property uchar green\nproperty uchar blue\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n\
@@ -67,31 +65,125 @@ fn gltf_files() -> [Vec<u8>; 2] {
     [text.into_bytes(), [b"glTF", &word(2)[..], &word(12 + chunks.len()), &chunks].concat()]
 }
 
-#[test]
-fn no_file_makes_a_mesh_reader_panic() {
-    let dir = tempfile::tempdir().unwrap();
-    type Load = fn(&Path) -> Result<Mesh>;
-    let [text, binary] = gltf_files();
-    let meshes: [(&str, Load, Vec<u8>); 6] = [
-        ("mesh.ply", ply::load, PLY.into()),
-        ("binary.ply", ply::load, binary_ply()),
-        ("mesh.stl", stl::load, binary_stl()),
-        ("mesh.obj", obj::load, OBJ.into()),
-        ("mesh.gltf", gltf::load, text),
-        ("mesh.glb", gltf::load, binary),
-    ];
-    for (name, load, good) in meshes {
-        let path = dir.path().join(name);
-        fs::write(&path, &good).unwrap();
-        assert!(load(&path).is_ok_and(|mesh| mesh.warnings.is_empty()), "{name}: {:?}", load(&path));
-        let found = proptest::test_runner::TestRunner::new(config(400)).run(&spoiled(), |spoiled| {
-            fs::write(&path, spoiled.of(&good)).unwrap();
-            if let Ok(mut mesh) = load(&path) {
-                mesh.normalise(Up::Z);
-                prop_assert!(mesh.vertices.len() % 3 == 0 && !mesh.vertices.is_empty());
-            }
-            Ok(())
-        });
-        assert!(found.is_ok(), "{name}: {}", found.unwrap_err());
+/// A red square of an AC3D file.
+const AC3D: &str = "AC3Db\nMATERIAL \"red\" rgb 1 0 0  amb 1 1 1  emis 0 0 0  spec 0 0 0  shi 8  trans 0\nOBJECT world\nkids 1\n\
+    OBJECT poly\nname \"a square\"\ndata 3\nabc\ntexture \"wood.png\"\ntexrep 2 2\nloc 0 0 1\nrot 0 1 0 1 0 0 0 0 1\nnumvert 4\n\
+    0 0 0\n1 0 0\n1 1 0\n0 1 0\nnumsurf 1\nSURF 0x20\nmat 0\nrefs 4\n0 0 0\n1 1 0\n2 1 1\n3 0 1\nkids 0\n";
+/// A strip as TORCS has them.
+const ACC: &str = "AC3Db\nMATERIAL \"m\" rgb 1 1 1\nOBJECT world\nkids 1\nOBJECT poly\ntexture \"paint.rgb\" base\n\
+    texture \"wood.png\" shad\nnumvert 4\n0 0 0 0 0 1\n1 0 0 0 0 1\n0 1 0 0 1 0\n1 1 0 0 1 0\nnumsurf 1\nSURF 0x14\nmat 0\n\
+    refs 4\n0 0 0 0 0\n1 1 0 0 0\n2 0 1 0 0\n3 1 1 0 0\nkids 0\n";
+const VRML: &str = "#VRML V2.0 utf8\nDEF P Transform { translation 0 0 5 rotation 0 0 1 0.5 scale 2 2 2 children [ Shape {\n\
+    appearance Appearance { material DEF RED Material { diffuseColor 1 0 0 } } geometry IndexedFaceSet { coord DEF POINTS Coordinate\n\
+    { point [0 0 0, 1 0 0, 1 1 0, 0 1 0] } coordIndex [0, 1, 2, 3, -1] color Color { color [1 0 0, 0 1 0, 0 0 1, 1 1 1] } } } ] }\n\
+    Switch { whichChoice 0 choice [ USE P, Shape { geometry IndexedFaceSet { coord USE POINTS coordIndex [0 1 2] } } ] }\n";
+/// A part, a sub-file and the colours.
+const LDRAW: [(&str, &str); 3] = [
+    ("parts/part.dat", "0 A part\n1 16 0 0 0 1 0 0 0 1 0 0 0 1 s\\sub.dat\n4 4 0 0 0 1 0 0 1 1 0 0 1 0\n2 24 0 0 0 1 1 1\n"),
+    ("parts/s/sub.dat", "3 16 0 0 0 1 0 0 0 1 0\n3 24 0 0 0 1 0 0 0 1 0\n3 0x20000FF 0 0 0 1 0 0 0 1 0\n"),
+    ("LDConfig.ldr", "0 !COLOUR Red CODE 4 VALUE #FF0000 EDGE #330000\n0 !COLOUR Blue CODE 1 VALUE #0000FF EDGE 4\n"),
+];
+
+/// A text STL file of one triangle.
+const STL: &str =
+    "solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 2 0\nendloop\nendfacet\nendsolid x\n";
+
+/// A 4×2 picture as SGI files have them, run-length encoded.
+fn sgi() -> Vec<u8> {
+    let mut bytes = vec![0; 512];
+    for (at, value) in [(0, 0x01), (1, 0xda), (2, 1), (3, 1), (5, 3), (7, 4), (9, 2), (11, 3), (19, 255)] {
+        bytes[at] = value;
     }
+    let rows = 6u32; // 2 rows of 3 channels, each 4 equal bytes and the mark of the end
+    bytes.extend((0..rows).flat_map(|row| (512 + 8 * rows + 3 * row).to_be_bytes()));
+    bytes.extend((0..rows).flat_map(|_| 3u32.to_be_bytes()));
+    bytes.extend((0..rows as u8).flat_map(|row| [4, 40 * row, 0]));
+    bytes
+}
+
+fn png() -> Vec<u8> {
+    let mut bytes = std::io::Cursor::new(vec![]);
+    image::RgbaImage::from_fn(5, 3, |x, y| image::Rgba([40 * x as u8, 80 * y as u8, 9, 255]))
+        .write_to(&mut bytes, image::ImageFormat::Png)
+        .unwrap();
+    bytes.into_inner()
+}
+
+/// Reads the first file while any of them, in turn, is not as it should be.
+fn survive(target: &str, files: &[(&str, Vec<u8>)]) {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name);
+    for (name, good) in files {
+        fs::create_dir_all(path(name).parent().unwrap()).unwrap();
+        fs::write(path(name), good).unwrap();
+    }
+    let mesh_file = path(files[0].0);
+    let good = mesh::load(&mesh_file).unwrap().0;
+    assert!(good.warnings.is_empty() && good.textures.len() < files.len(), "{target}: {:?}", good.warnings);
+    fuzz(target, 400, &one_spoiled(files.len()), |(which, spoiled)| {
+        for (k, (name, good)) in files.iter().enumerate() {
+            let bytes = if k == which { spoiled.of(good) } else { good.clone() };
+            fs::write(path(name), bytes).unwrap();
+        }
+        match mesh::load(&mesh_file) {
+            Ok((mut mesh, up)) => {
+                mesh.normalise(up);
+                let is_finite =
+                    |v: &mesh::Vertex| v.position.is_finite() && v.normal.is_finite() && v.colour.is_finite() && v.uv.is_finite();
+                prop_assert!(mesh.vertices.iter().all(is_finite));
+                prop_assert!(mesh.vertices.len() % 3 == 0 && !mesh.vertices.is_empty());
+                prop_assert!(mesh.parts.iter().all(|part| part.vertices.end <= mesh.vertices.len()));
+                prop_assert!(mesh.parts.iter().all(|part| part.texture.is_none_or(|texture| texture < mesh.textures.len())));
+                prop_assert!(mesh.warnings.iter().all(|warning| !warning.contains('\n')), "{:?}", mesh.warnings);
+            }
+            Err(error) => prop_assert!(!error.to_string().contains('\n'), "{error}"),
+        }
+        Ok(())
+    });
+}
+
+#[test]
+fn fuzz_obj() {
+    let material = "newmtl wood\nKd 0.5 0.25 0\nmap_Kd wood.png\n";
+    let text = format!("mtllib things.mtl\nusemtl wood\n{OBJ}");
+    survive("obj", &[("mesh.obj", text.into()), ("things.mtl", material.into()), ("wood.png", png())]);
+}
+
+#[test]
+fn fuzz_ply() {
+    survive("ply", &[("mesh.ply", PLY.into())]);
+    survive("ply-binary", &[("mesh.ply", binary_ply())]);
+}
+
+#[test]
+fn fuzz_stl() {
+    survive("stl", &[("mesh.stl", STL.into())]);
+    survive("stl-binary", &[("mesh.stl", binary_stl())]);
+}
+
+#[test]
+fn fuzz_gltf() {
+    let [text, binary] = gltf_files();
+    survive("gltf", &[("mesh.gltf", text)]);
+    survive("glb", &[("mesh.glb", binary)]);
+}
+
+#[test]
+fn fuzz_ldraw() {
+    // Whichever colour the part's name asks for.
+    let colour = |code: u32| format!("0 !COLOUR Grey CODE {code} VALUE #8080{code:02} EDGE #333333\n");
+    let mut files = LDRAW.map(|(name, text)| (name, text.to_owned()));
+    files[2].1.extend((0..80).map(colour));
+    survive("ldraw", &files.map(|(name, text)| (name, text.into_bytes())));
+}
+
+#[test]
+fn fuzz_ac3d() {
+    survive("ac3d", &[("mesh.ac", AC3D.into()), ("wood.png", png())]);
+    survive("ac3d-torcs", &[("mesh.acc", ACC.into()), ("paint.rgb", sgi())]);
+}
+
+#[test]
+fn fuzz_vrml() {
+    survive("vrml", &[("mesh.wrl", VRML.into())]);
 }

@@ -28,7 +28,7 @@ enum Command {
     Import(Import),
     /// Write a data set, or estimated poses, in another format, in the frame and the units that it was imported from.
     Export(Export),
-    /// Count, check and draw posed pictures. Exit status 1 if something is wrong with them.
+    /// Count, check and draw posed pictures, or read meshes. Exit status 1 if something is wrong with them.
     Inspect(Inspect),
 }
 

@@ -1,0 +1,32 @@
+//! Model files that are not as they should be.
+
+use proptest::prelude::*;
+use sigma_srn::{Model, ModelConfig};
+use std::path::Path;
+
+#[path = "../../data/tests/spoil/mod.rs"]
+mod spoil;
+
+#[test]
+fn fuzz_model() {
+    let config = ModelConfig { hidden: 2, latent: 3, instances: 2, tracing_steps: 4, density: true };
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("model.safetensors");
+    let mut model = Model::init(&config, 1).unwrap();
+    model.metadata.instance_names = vec!["a".into(), "b".into()];
+    model.save(&path).unwrap();
+    let good = std::fs::read(&path).unwrap();
+    assert_eq!(Model::load(&path).unwrap(), model);
+    spoil::fuzz("model", 400, &spoil::spoiled(), |spoiled| {
+        match Model::from_bytes(&spoiled.of(&good), "", Path::new("model.safetensors")) {
+            Ok(model) => {
+                let tensors = model.tensors();
+                prop_assert!(tensors.iter().all(|(_, shape, values)| shape.iter().product::<usize>() == values.len()));
+                prop_assert!(tensors.iter().all(|(.., values)| values.iter().all(|value| value.is_finite())));
+                prop_assert!(model.layout.tracing_steps >= 1);
+            }
+            Err(error) => prop_assert!(error.to_string().contains("model.safetensors") || error.to_string().contains("tensor")),
+        }
+        Ok(())
+    });
+}
