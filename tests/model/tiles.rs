@@ -3,7 +3,7 @@
 use sigma_srn::{Descent, Engine, Error, Method, Renderer, Train};
 use srn_tests::{assert_close, difference, gpu};
 
-use crate::{RAYS, SIZE, batch, descent, intrinsics, methods, model, poses, trainer};
+use crate::{RAYS, SIZE, batch, descent, intrinsics, methods, model, poses, trainer, weights};
 
 /// Engines with the largest difference that passes, relative to the largest value of a tensor: other tiles, other order of sums.
 fn engines() -> [(Engine, f64); 3] {

@@ -157,7 +157,8 @@ mod tests {
         let left = saved(dir.path(), "left.png", left);
         let both = Target::of_photo(&cut, Some(&left), &INTRINSICS, 6).unwrap();
         assert_eq!((both.corner, both.extent), ([39, 5], 8));
-        assert_eq!((both.weights.as_ref().unwrap()[0], both.weights.as_ref().unwrap()[5]), (1.0, 0.0));
+        // 7 of its 8 columns are in the mask; the last of the square's takes in the last one and a third.
+        assert_eq!(both.weights.unwrap()[..6], [1.0, 1.0, 1.0, 1.0, 1.0, 0.25]);
     }
 
     #[test]

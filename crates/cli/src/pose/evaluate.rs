@@ -141,7 +141,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
             let (truth, intrinsics) = camera(&view);
             let square = ([0; 2], side as usize);
             let (name, rgb) = (view.name, view.rgb);
-            (Picture { name, instance, rgb, weights: None, intrinsics, truth: Some(truth), square }, truth)
+            (Picture { name, instance, rgb, weights: None, intrinsics, truth: Some(truth), distance: None, square }, truth)
         };
         Ok(files.load(side as usize)?.views.into_iter().map(picture).collect())
     };
