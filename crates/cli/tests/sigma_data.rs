@@ -221,7 +221,8 @@ fn photographs_go_in_and_poses_come_out_as_they_came() {
     let rows: Vec<_> = pose.chunks(4).collect();
     let estimate = serde_json::json!({"image": "set/thing/rgb/0312.png", "instance": "other", "world_from_camera": rows,
         "unexplained": 0.25, "seconds": 1.5, "loss": 0.1});
-    fs::write(dir.path().join("found.json"), serde_json::json!({"images": [estimate]}).to_string()).unwrap();
+    fs::write(dir.path().join("found.json"), serde_json::json!({"convention": "opencv", "images": [estimate]}).to_string())
+        .unwrap();
     let found = ["--poses", &path("found.json")];
     run(&[&["export", &instance, "--format", "transforms", "--out", &path("found")], &found[..]].concat(), 0);
     let after = matrices(&json(&dir.path().join("found/thing/transforms.json")));

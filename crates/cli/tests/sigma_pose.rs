@@ -147,7 +147,10 @@ fn records_are_written_once() {
     let lines = run(dir, &(args.clone() + " --accept 1e9"), 0);
     assert_eq!(lines.lines().count(), 2);
     assert!(lines.contains("chicken") && lines.contains("loss") && lines.contains("error") && !lines.contains("NOT"), "{lines}");
-    let written = ["chicken-000003-again.gif", "chicken-000003-again.png", "chicken-000003.gif", "chicken-000003.png"];
+    let names = ["chicken-000003", "chicken-000003-again"];
+    let mut written: Vec<_> =
+        names.iter().flat_map(|name| ["-outline.png", ".gif", ".png"].map(|end| format!("{name}{end}"))).collect();
+    written.sort();
     assert_eq!(files(&dir.join("pictures")), written);
     let page = image::open(dir.join("pictures/chicken-000003.png")).unwrap();
     assert!(page.width() > 1000 && page.height() > 400);
@@ -190,7 +193,7 @@ fn a_search_that_blows_up_has_not_converged() {
     let report: Value = serde_json::from_str(&run(dir, &format!("{args} --json --record pictures"), 1)).unwrap();
     let image = &report["images"][0];
     assert!(image["loss"].is_null() && image["converged"] == false, "{image}");
-    assert_eq!(files(&dir.join("pictures")).len(), 2);
+    assert_eq!(files(&dir.join("pictures")).len(), 3);
     assert!(run(dir, &args, 1).contains("NOT CONVERGED"));
     run(dir, "evaluate --model large.safetensors --data DATA --instances 1 --views 1 --steps 2 --executor cpu --out results", 0);
 }
@@ -222,6 +225,13 @@ fn bad_calls_end_with_2_and_one_line() {
         (format!("{image} {model} --starts short.txt"), &["short.txt", "line 1"]),
         (format!("{image} {model} --starts fixed25"), &["fixed25", "around84"]),
         (format!("{image} {model} --starts neighbor4"), &["--rough"]),
+        (format!("{image} {model} --convention blender"), &["blender", "opencv, opengl"]),
+        (format!("{image} {model} --frame nowhere.json"), &["nowhere.json"]),
+        (format!("{image} {model} --frame short.txt"), &["short.txt", "line 1"]),
+        (format!("{image} {model} --mask nowhere.png"), &["nowhere.png"]),
+        (format!("{image} {model} --mask ."), &["000003.png", "the mask of"]),
+        (format!("{image} {model} --mask nan.txt"), &["nan.txt", "not a readable image"]),
+        (format!("{image} {model} --mask a.png --mask b.png"), &["--mask", "2 masks for 1"]),
         (format!("{image} {model} --truth nan.txt --truth nan.txt"), &["--truth", "2 poses for 1"]),
         (format!("{image} {model} --loss l3"), &["l3", "gmsd"]),
         (format!("{image} {model} --loss mse"), &["--loss", "--preset paper"]),
@@ -255,7 +265,7 @@ fn evaluate_prints_a_table_and_keeps_the_results() {
     let table = run(dir, &format!("{args} --out results"), 0);
     let rows: Vec<Vec<&str>> = table.lines().map(|line| line.split('|').map(str::trim).collect()).collect();
     assert_eq!(rows.iter().map(|row| row[1]).collect::<Vec<_>>(), ["instance", "---------:", "bucket", "chicken", "all"]);
-    assert!(rows.iter().all(|row| row.len() == 14) && rows[4][2] == "4", "{table}");
+    assert!(rows.iter().all(|row| row.len() == 18) && rows[4][2] == "4", "{table}");
     assert_eq!(files(&dir.join("results")), ["pictures.png", "results.json"]);
     assert!(image::open(dir.join("results/pictures.png")).unwrap().width() > 500);
     let results: Value = serde_json::from_slice(&fs::read(dir.join("results/results.json")).unwrap()).unwrap();
@@ -298,4 +308,129 @@ fn render_makes_pictures_animations_and_folders() {
     fail(dir, &format!("{error} orbit --orbit 2"), &["orbit", "--force"]);
     render("--out orbit --orbit 2 --force");
     assert_eq!(files(&dir.join("orbit/rgb")), ["000000.png", "000001.png"]);
+}
+
+const BOX: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../data/tests/box");
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).unwrap()
+}
+
+fn write_pose(path: &Path, pose: &DMat4) {
+    let rows: Vec<String> = pose.transpose().to_cols_array().iter().map(f64::to_string).collect();
+    fs::write(path, rows.join(" ")).unwrap();
+}
+
+/// Poses go in and come out in other axes, in the frame and units of the photographs, and mean the same.
+#[test]
+fn poses_are_given_and_printed_as_they_came() {
+    let home = home();
+    let dir = home.path();
+    let import = ["import", BOX, "--out", "set", "--name", "seat", "--side", "16"];
+    let done = Command::new(env!("CARGO_BIN_EXE_sigma-data")).current_dir(dir).args(import).output().unwrap();
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    // The pose in metres and OpenGL axes that came with the photograph.
+    let source = json(&fs::read_to_string(format!("{BOX}/transforms.json")).unwrap());
+    let source = matrix(&source["frames"][1]["transform_matrix"]);
+    write_pose(&dir.join("source.txt"), &source);
+    let picture = "estimate set/seat/rgb/0156.png --model model.safetensors --executor cpu --steps 3 --accept 1e9 --json";
+    let found = |args: &str| json(&run(dir, &format!("{picture} {args}"), 0));
+    let plain = found("--rough auto --truth auto");
+    let outside = "--convention opengl --frame set/seat/frame.json";
+    let other = found(&format!("--rough source.txt --truth source.txt {outside}"));
+    assert_eq!((plain["convention"].as_str(), other["convention"].as_str()), (Some("opencv"), Some("opengl")));
+    let [plain, other] = [&plain, &other].map(|report| &report["images"][0]);
+    // Rough poses that are the same but for the last digit: so is everything that is found.
+    let world = matrix(&plain["world_from_camera"]);
+    let flipped = DMat4::from_diagonal(glam::DVec4::new(1.0, -1.0, -1.0, 1.0));
+    assert!(matrix(&other["world_from_camera"]).abs_diff_eq(world * flipped, 1e-4));
+    let error = |report: &Value, name: &str| report["error"][name].as_f64().unwrap();
+    assert!((error(plain, "rotation_deg") - error(other, "rotation_deg")).abs() < 1e-2);
+    let share = error(plain, "translation_percent") / error(plain, "translation");
+    let distance = srn_data::srn::read_pose(&dir.join("set/seat/pose/0156.txt")).unwrap().w_axis.truncate().length();
+    assert!((share - 100.0 / distance).abs() < 1e-9);
+    // In metres, the camera is as far from the true one as it is in object units, times the object's size.
+    let [in_source, in_opencv] = [other, plain].map(|report| matrix(&report["source_from_camera"]));
+    assert!(in_source.abs_diff_eq(in_opencv * flipped, 1e-4));
+    let (rotation, metres) = pose_error(&in_source, &source);
+    assert!((rotation - error(other, "rotation_deg")).abs() < 1e-6);
+    let diagonal = metres / error(other, "translation");
+    assert!((0.3..0.4).contains(&diagonal), "the box is a third of a metre: {diagonal}");
+
+    // The line says the same, and a start in a file is read like a rough pose.
+    let line = run(dir, &format!("{} --starts source.txt {outside}", picture.replace(" --json", "")), 0);
+    let told = line.split("centre ").nth(1).unwrap().split_whitespace().take(3).map(|x| x.parse::<f64>().unwrap());
+    let start = found(&format!("--starts source.txt {outside}"));
+    let centre = matrix(&start["images"][0]["source_from_camera"]).w_axis.truncate();
+    assert!(told.zip(centre.to_array()).all(|(a, b)| (a - b).abs() < 1e-3), "{line} {centre}");
+    let far = pose_error(&matrix(&start["images"][0]["source_from_camera"]), &source).0;
+    assert!(far < 30.0, "the search began at the true pose: {far}°");
+
+    // A rendered view does not depend on how its pose is written.
+    let render = "render --model model.safetensors --instance seat --executor cpu";
+    run(dir, &format!("{render} --pose set/seat/pose/0156.txt --out a.png"), 0);
+    run(dir, &format!("{render} --pose source.txt --out b.png {outside}"), 0);
+    let [a, b] = ["a.png", "b.png"].map(|name| image::open(dir.join(name)).unwrap().into_rgb8());
+    assert!(a.iter().zip(b.iter()).all(|(a, b)| a.abs_diff(*b) <= 1));
+    assert!(a.pixels().any(|pixel| pixel != a.get_pixel(0, 0)), "a view of one colour tells nothing");
+
+    // What export makes of estimates does not depend on their axes either.
+    let exported = |args: &str| {
+        fs::write(dir.join("found.json"), serde_json::to_string(&found(args)).unwrap()).unwrap();
+        let export = ["export", "set/seat", "--poses", "found.json", "--format", "transforms", "--out", "back", "--force"];
+        let done = Command::new(env!("CARGO_BIN_EXE_sigma-data")).current_dir(dir).args(export).output().unwrap();
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        matrix(&json(&fs::read_to_string(dir.join("back/seat/transforms.json")).unwrap())["frames"][0]["transform_matrix"])
+    };
+    assert!(exported("--rough auto").abs_diff_eq(exported("--rough auto --convention ros"), 1e-12));
+    assert!(exported("--rough auto").abs_diff_eq(in_source, 1e-4), "transforms.json has OpenGL axes and metres");
+
+    // evaluate tells errors in metres as well.
+    let evaluate = "evaluate --model model.safetensors --data set --views 2 --steps 3 --executor cpu --convention ros --json";
+    let report = json(&run(dir, evaluate, 0));
+    let view = &report["views"][0];
+    let ratio = view["translation_source"].as_f64().unwrap() / view["error"]["translation"].as_f64().unwrap();
+    assert!((ratio - diagonal).abs() < 1e-3 && report["overall"]["translation_source"]["median"].is_f64(), "{ratio}");
+    assert_eq!((report["convention"].as_str(), view["source_from_camera"].is_array()), (Some("ros"), true));
+}
+
+/// A photograph with a mask: it is cut around the object, what is masked out changes nothing, and the outline is drawn on it.
+#[test]
+fn a_mask_takes_pixels_out_of_the_search() {
+    let home = home();
+    let dir = home.path();
+    fs::create_dir(dir.join("masks")).unwrap();
+    fs::copy(format!("{BOX}/masks/0156.png"), dir.join("masks/0156.png")).unwrap();
+    fs::copy(format!("{BOX}/images/0156.jpg"), dir.join("0156.jpg")).unwrap();
+    let mask = image::open(dir.join("masks/0156.png")).unwrap().into_luma8();
+    let mut painted = image::open(dir.join("0156.jpg")).unwrap().into_rgb8();
+    let size = painted.dimensions();
+    fs::create_dir(dir.join("other")).unwrap();
+    let hidden = |x: u32, y: u32| mask.get_pixel(x, y).0[0] == 0;
+    painted.save(dir.join("0156.png")).unwrap();
+    painted.enumerate_pixels_mut().filter(|(x, y, _)| hidden(*x, *y)).for_each(|(.., pixel)| pixel.0 = [255, 0, 255]);
+    painted.save(dir.join("other/0156.png")).unwrap();
+    let args = "--model model.safetensors --executor cpu --steps 3 --accept 1e9 --fov 53.5 --instance seat --json";
+    let found = |image: &str, mask: &str| {
+        let mut image = json(&run(dir, &format!("estimate {image} {args} {mask}"), 0))["images"][0].take();
+        let map = image.as_object_mut().unwrap();
+        map.remove("seconds");
+        map.remove("image");
+        image
+    };
+    let [plain, other] = ["0156.png", "other/0156.png"].map(|image| found(image, "--mask masks --record pictures --force"));
+    assert_eq!(plain, other);
+    assert_ne!(found("0156.png", ""), found("other/0156.png", ""), "without a mask all counts");
+    assert_ne!(plain, found("0156.png", ""));
+    assert_eq!(plain, found("0156.png", "--mask masks/0156.png"));
+    // The box lies beside the middle: the starts look at where it is.
+    let outline = image::open(dir.join("pictures/seat-0156-outline.png")).unwrap().into_rgb8();
+    let factor = outline.width() / size.0;
+    assert_eq!(outline.dimensions(), (factor * size.0, factor * size.1));
+    let fail_with = |args: &str, words: &[&str]| fail(dir, &format!("estimate 0156.png --model model.safetensors {args}"), words);
+    fail_with("--fov 53.5 --instance seat --mask masks --preset paper --loss gmsd --executor cpu", &["GMSD"]);
+    image::GrayImage::new(size.0, size.1).save(dir.join("black.png")).unwrap();
+    fail_with("--fov 53.5 --instance seat --mask black.png", &["black.png", "nothing"]);
+    image::GrayImage::new(8, 8).save(dir.join("small.png")).unwrap();
+    fail_with("--fov 53.5 --instance seat --mask small.png", &["small.png", "8×8"]);
 }

@@ -18,6 +18,8 @@ pub struct Target {
     pub weights: Option<Vec<f32>>,
     /// `fx, fy, cx, cy` in pixels of the square; integer coordinates are pixel centres.
     pub intrinsics: [f32; 4],
+    /// Whether the square was cut around the object.
+    pub cut: bool,
     /// The first pixel of the square in the picture, across and down; outside of it where the square reaches out.
     pub corner: [i64; 2],
     /// Width and height of the square in pixels of the picture.
@@ -33,12 +35,12 @@ impl Target {
         let corner = size.map(|s| ((s - extent) / 2) as i64);
         let Some(mask) = mask else {
             let (pixels, intrinsics) = load_square(path, intrinsics, side)?;
-            return Ok(Self { rgb: pixels.data, weights: None, intrinsics, corner, extent });
+            return Ok(Self { rgb: pixels.data, weights: None, intrinsics, cut: false, corner, extent });
         };
         let (picture, counts) = (Pixels::open(path)?, counts(mask, size)?);
         let Intrinsics { focal: [fx, fy], centre: [cx, cy], .. } = intrinsics.of_picture(path, size)?.of_square(side);
         let (rgb, weights) = weighted(&picture, &counts, corner, extent, side);
-        Ok(Self { rgb, weights: Some(weights), intrinsics: [fx, fy, cx, cy].map(|x| x as f32), corner, extent })
+        Ok(Self { rgb, weights: Some(weights), intrinsics: [fx, fy, cx, cy].map(|x| x as f32), cut: false, corner, extent })
     }
 
     /// Reads a photograph and cuts a square around what mask and transparency leave of it, with [`MARGIN`]; the intrinsics follow.
@@ -76,7 +78,7 @@ impl Target {
             }
             None => (picture.square(corner, extent, 1.0).area_resample(side, side).data, None),
         };
-        Ok(Self { rgb, weights, intrinsics, corner, extent })
+        Ok(Self { rgb, weights, intrinsics, cut: true, corner, extent })
     }
 }
 
@@ -155,7 +157,8 @@ mod tests {
         let left = saved(dir.path(), "left.png", left);
         let both = Target::of_photo(&cut, Some(&left), &INTRINSICS, 6).unwrap();
         assert_eq!((both.corner, both.extent), ([39, 5], 8));
-        assert_eq!((both.weights.as_ref().unwrap()[0], both.weights.as_ref().unwrap()[5]), (1.0, 0.0));
+        // 7 of its 8 columns are in the mask; the last of the square's takes in the last one and a third.
+        assert_eq!(both.weights.unwrap()[..6], [1.0, 1.0, 1.0, 1.0, 1.0, 0.25]);
     }
 
     #[test]

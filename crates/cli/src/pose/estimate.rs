@@ -119,8 +119,10 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let sources = args.images.iter().map(|path| args.poses.source(srn_instance(path).as_deref())).collect::<Result<Vec<_>>>()?;
     let default = if args.rough.is_empty() { Starts::Around84 } else { Starts::Neighbor4 };
     let starts = args.starts.as_ref().unwrap_or(&default);
-    let starts =
-        rough.iter().map(|rough| args.search.starts(starts, &model, rough.as_ref(), &notation)).collect::<Result<Vec<_>>>()?;
+    let starts = |(picture, rough): (&Picture, &Option<DMat4>)| {
+        args.search.starts(starts, &model, picture, side, rough.as_ref(), &notation)
+    };
+    let starts = pictures.iter().zip(&rough).map(starts).collect::<Result<Vec<_>>>()?;
     if let Some(dir) = &args.record {
         let of = |end: &'static str| pictures.iter().map(move |p| dir.join(format!("{}{end}", p.name)));
         let files = [".png", ".gif", "-outline.png"].into_iter().flat_map(of);

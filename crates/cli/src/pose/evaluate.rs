@@ -141,7 +141,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
             let (truth, intrinsics) = camera(&view);
             let square = ([0; 2], side as usize);
             let (name, rgb) = (view.name, view.rgb);
-            (Picture { name, instance, rgb, weights: None, intrinsics, truth: Some(truth), square }, truth)
+            (Picture { name, instance, rgb, weights: None, intrinsics, truth: Some(truth), distance: None, square }, truth)
         };
         Ok(files.load(side as usize)?.views.into_iter().map(picture).collect())
     };
@@ -150,10 +150,8 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     let mut queries = Vec::new();
     for files in &instances {
         let (pictures, truths): (Vec<_>, Vec<_>) = pictures(files)?.into_iter().unzip();
-        let starts = truths
-            .iter()
-            .map(|truth| args.search.starts(&args.starts, &model, Some(truth), &notation))
-            .collect::<Result<Vec<_>>>()?;
+        let starts = |(picture, truth)| args.search.starts(&args.starts, &model, picture, side, Some(truth), &notation);
+        let starts = pictures.iter().zip(&truths).map(starts).collect::<Result<Vec<_>>>()?;
         queries.push((&files.name, args.poses.source(Some(&files.dir))?, pictures, truths, starts));
     }
     let files = ["results.json", "pictures.png"];

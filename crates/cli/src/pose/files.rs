@@ -9,11 +9,15 @@ use image::{Delay, Frame, ImageFormat, RgbImage};
 use sigma_srn::{Intrinsics, Model, write_atomically};
 use srn_data::formats::mask_in;
 use srn_data::srn::{self, picture_size};
-use srn_data::target::Target;
+use srn_data::target::{MARGIN, Target};
 
 use super::notation::Notation;
 use super::positive;
 use crate::common::Result;
+
+/// How long objects are in a picture, as a share of their diagonal: about that of a cube, of a ball in its box, and seen along the
+/// longest side.
+const SPAN: f64 = 0.8;
 
 /// Reads a model; every error names the file.
 pub fn load_model(path: &Path) -> Result<Model> {
@@ -109,6 +113,8 @@ pub struct Picture {
     pub intrinsics: Intrinsics,
     /// Its true `world_from_camera`, if known.
     pub truth: Option<DMat4>,
+    /// How far the object is in object units, by the size of the square that was cut around it.
+    pub distance: Option<f64>,
     /// Where the square lies in the picture as it is on disk: first pixel, width and height.
     pub square: ([i64; 2], usize),
 }
@@ -147,6 +153,7 @@ impl Picture {
             weights: target.weights,
             intrinsics: Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 },
             truth: None,
+            distance: target.cut.then(|| fx * SPAN * (1.0 + 2.0 * MARGIN) / f64::from(side)),
             square: (target.corner, target.extent),
         })
     }

@@ -31,11 +31,17 @@ pub struct Notation {
     world_from_source: DMat4,
 }
 
+impl Default for Notation {
+    /// As inside.
+    fn default() -> Self {
+        Notation { axes: Axes::OpenCv, world_from_source: DMat4::IDENTITY }
+    }
+}
+
 impl NotationArgs {
     /// Reads the file of --frame.
     pub fn open(&self) -> Result<Notation> {
-        let record = self.frame.as_deref().map(FrameRecord::open).transpose()?;
-        Ok(Notation { axes: self.convention, world_from_source: record.map_or(DMat4::IDENTITY, |record| record.matrix()) })
+        Ok(self.source(None)?.unwrap_or(Notation { axes: self.convention, ..Notation::default() }))
     }
 
     /// How poses are written in the source of the instance in folder `dir`, if it was imported, or in that of --frame.

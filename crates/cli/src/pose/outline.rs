@@ -15,6 +15,8 @@ use crate::common::Result;
 const LINE: Colour = [60, 255, 90];
 /// The view is rendered at most at this many times the side that the model takes.
 const FINEST: usize = 4;
+/// It shows this many times the square's width: an object of which only a part counts reaches out of its square.
+const WIDER: usize = 2;
 /// Shorter pictures are enlarged until they have this height, pixels.
 const LEAST_HEIGHT: u32 = 320;
 
@@ -22,21 +24,22 @@ const LEAST_HEIGHT: u32 = 320;
 pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, engine: &Engine, model: &Model, side: u32) -> Result<()> {
     let (corner, extent) = picture.square;
     let times = extent.div_ceil(side as usize).clamp(1, FINEST) as u32;
-    let k = f64::from(times);
+    let (k, before) = (f64::from(times), 0.5 * (WIDER - 1) as f64 * f64::from(side));
     let Intrinsics { fx, fy, cx, cy, pixel_center } = picture.intrinsics;
     // Edges of pixels stay where they are, half a pixel before the centres.
-    let [cx, cy] = [cx, cy].map(|c| k * (c + 0.5) - 0.5);
-    let finer = Intrinsics { fx: k * fx, fy: k * fy, cx, cy, pixel_center };
-    let view = &render(engine, model, times * side, &[(picture.instance, found.world_from_camera, finer)])?[0];
-    let silhouette = Silhouette::of(&view.rgb, (times * side) as usize);
+    let [cx, cy] = [cx, cy].map(|c| k * (c + before + 0.5) - 0.5);
+    let view_side = WIDER as u32 * times * side;
+    let camera = Intrinsics { fx: k * fx, fy: k * fy, cx, cy, pixel_center };
+    let view = &render(engine, model, view_side, &[(picture.instance, found.world_from_camera, camera)])?[0];
+    let silhouette = Silhouette::of(&view.rgb, view_side as usize);
 
     let photo = Pixels::open(path)?.to_rgb8();
     let factor = LEAST_HEIGHT.div_ceil(photo.height());
     let mut page = sheet::enlarge(&photo, factor);
     let inside = |[x, y]: [i64; 2]| {
         let place = [(x, corner[0]), (y, corner[1])];
-        let at = place.map(|(x, first)| ((x as f64 + 0.5) / f64::from(factor) - first as f64) / extent as f64);
-        silhouette.covers(at)
+        let in_square = place.map(|(x, first)| ((x as f64 + 0.5) / f64::from(factor) - first as f64) / extent as f64);
+        silhouette.covers(in_square.map(|x| (x - 0.5) / WIDER as f64 + 0.5))
     };
     draw(&mut page, inside);
     write_png(&dir.join(format!("{}-outline.png", picture.name)), &page)
@@ -58,7 +61,27 @@ impl Silhouette {
         let mut object: Vec<f32> = darkness.iter().copied().filter(|&d| d > 0.2).collect();
         object.sort_by(f32::total_cmp);
         let limit = object.get(object.len() / 2).map_or(f32::INFINITY, |median| 0.5 * median);
-        Silhouette { side, darkness, limit }
+        Silhouette { side, darkness, limit }.filled()
+    }
+
+    /// White that no way leads to from the edge is print on the object, not background.
+    fn filled(mut self) -> Self {
+        let n = self.side;
+        let mut reached = vec![false; n * n];
+        let mut next: Vec<usize> = (0..n).flat_map(|i| [i, n * (n - 1) + i, n * i, n * i + n - 1]).collect();
+        while let Some(pixel) = next.pop() {
+            if self.darkness[pixel] > self.limit || std::mem::replace(&mut reached[pixel], true) {
+                continue;
+            }
+            let (x, y) = (pixel % n, pixel / n);
+            let around = [(x > 0).then(|| pixel - 1), (x + 1 < n).then_some(pixel + 1)];
+            let above = [(y > 0).then(|| pixel - n), (y + 1 < n).then_some(pixel + n)];
+            next.extend(around.into_iter().chain(above).flatten());
+        }
+        let limit = self.limit;
+        let enclosed = self.darkness.iter_mut().zip(reached).filter(|(darkness, reached)| !reached && **darkness <= limit);
+        enclosed.for_each(|(darkness, _)| *darkness = 2.0 * limit);
+        self
     }
 
     /// Whether the object covers a place of the view, 0 to 1 across and down; smooth between pixels.
@@ -112,6 +135,12 @@ mod tests {
         draw(&mut page, |[x, y]| silhouette.covers([x as f64 / 100.0, y as f64 / 50.0]));
         let green: Vec<u32> = page.enumerate_pixels().filter(|(.., p)| p.0 == LINE).map(|(x, ..)| x).collect();
         assert!(green.len() >= 49 && green.iter().all(|x| (50..=51).contains(x)), "{green:?}");
+        // White that is enclosed belongs to the object.
+        let ring = |i: usize| (2..=5).contains(&(i % 8)) && (2..=5).contains(&(i / 8));
+        let hole = |i: usize| (3..=4).contains(&(i % 8)) && (3..=4).contains(&(i / 8));
+        let rgb: Vec<f32> = (0..64).flat_map(|i| [if ring(i) && !hole(i) { -1.0 } else { 1.0 }; 3]).collect();
+        let silhouette = Silhouette::of(&rgb, 8);
+        assert!(silhouette.covers([0.5, 0.5]) && silhouette.covers([0.3, 0.5]) && !silhouette.covers([0.1, 0.5]));
         // A white view has no outline.
         assert!(!Silhouette::of(&[1.0; 192], 8).covers([0.5, 0.5]));
     }

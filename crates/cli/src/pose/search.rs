@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
-use glam::DMat4;
+use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
 use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
 use sigma_srn::{
@@ -55,7 +55,8 @@ pub struct SearchArgs {
     // the wrong object left 0.32 to 0.60.
     #[arg(long, value_name = "X", default_value_t = 0.25, value_parser = positive)]
     accept: f64,
-    /// Distance of the starts of `around84` and `fixed24` from the object's centre, in object units. Default: as the model was trained.
+    /// Distance of the starts of `around84` and `fixed24` from the object's centre, in object units. Default: by the size of the object in a
+    /// photograph that is cut around it, else as the model was trained.
     #[arg(long, value_name = "R", value_parser = positive)]
     radius: Option<f64>,
 }
@@ -161,16 +162,31 @@ impl SearchArgs {
         Ok(found.collect())
     }
 
-    fn radius(&self, model: &Model) -> Result<f64> {
-        let radius = self.radius.or(model.metadata.orbit_radius);
-        Ok(radius.ok_or("the model does not say how far its cameras were: give --radius")?)
+    /// Starts all around the object, turned so that it appears in the middle of the picture: a cut may lie anywhere beside the
+    /// principal point.
+    fn around(&self, starts: fn(f64) -> Vec<DMat4>, model: &Model, picture: &Picture, side: u32) -> Result<Vec<DMat4>> {
+        let radius = self.radius.or(picture.distance).or(model.metadata.orbit_radius);
+        let radius = radius.ok_or("the model does not say how far its cameras were: give --radius")?;
+        let Intrinsics { fx, fy, cx, cy, .. } = picture.intrinsics;
+        let middle = f64::from(side) / 2.0;
+        let ray = DVec3::new((middle - cx) / fx, (middle - cy) / fy, 1.0).normalize();
+        let turn = DMat4::from_quat(DQuat::from_rotation_arc(ray, DVec3::Z));
+        Ok(starts(radius).into_iter().map(|start| start * turn).collect())
     }
 
-    /// The poses to start from; `rough` is the one that `neighbor4` turns.
-    pub fn starts(&self, starts: &Starts, model: &Model, rough: Option<&DMat4>, notation: &Notation) -> Result<Vec<DMat4>> {
+    /// The poses to start from for a picture of `side` pixels; `rough` is the one that `neighbor4` turns.
+    pub fn starts(
+        &self,
+        starts: &Starts,
+        model: &Model,
+        picture: &Picture,
+        side: u32,
+        rough: Option<&DMat4>,
+        notation: &Notation,
+    ) -> Result<Vec<DMat4>> {
         match starts {
-            Starts::Around84 => Ok(around84(self.radius(model)?)),
-            Starts::Fixed24 => Ok(fixed24(self.radius(model)?)),
+            Starts::Around84 => self.around(around84, model, picture, side),
+            Starts::Fixed24 => self.around(fixed24, model, picture, side),
             Starts::Neighbor4 => Ok(neighbor4(rough.ok_or("--starts neighbor4 turns a rough pose: give --rough")?)),
             Starts::File(path) if !path.exists() => {
                 Err(format!("--starts {}: no such file; expected around84, fixed24, neighbor4 or a file", path.display()).into())
@@ -258,14 +274,45 @@ pub fn render(engine: &Engine, model: &Model, side: u32, views: &[View]) -> Resu
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
+    use sigma_srn::ModelConfig;
+
+    #[derive(Parser)]
+    struct Flags {
+        #[command(flatten)]
+        search: SearchArgs,
+    }
+
+    fn picture(intrinsics: Intrinsics) -> Picture {
+        let (name, square) = (String::new(), ([0; 2], 1));
+        Picture { name, instance: 0, rgb: vec![], weights: None, intrinsics, truth: None, square, distance: None }
+    }
+
+    #[test]
+    fn starts_see_the_object_in_the_middle_of_a_cut() {
+        let model = Model::init(&ModelConfig { hidden: 4, latent: 2, instances: 1, tracing_steps: 1, density: true }, 0).unwrap();
+        let search = Flags::parse_from(["sigma-pose"]).search;
+        let starts = |picture: &Picture| {
+            search.starts(&Starts::Around84, &model, picture, 64, None, &Notation::default()).map_err(|e| e.to_string())
+        };
+        let cut = picture(Intrinsics { fx: 150.0, fy: 140.0, cx: -40.0, cy: 90.0, pixel_center: 0.0 });
+        assert!(starts(&cut).unwrap_err().contains("--radius"));
+        for start in starts(&Picture { distance: Some(2.5), ..cut }).unwrap() {
+            let DVec3 { x, y, z } = start.inverse().transform_point3(DVec3::ZERO);
+            assert!((150.0 * x / z - 40.0 - 32.0).abs() < 1e-9 && (140.0 * y / z + 90.0 - 32.0).abs() < 1e-9, "{start}");
+            assert!((start.w_axis.truncate().length() - 2.5).abs() < 1e-12);
+        }
+        // Pictures of data sets have their principal point there: nothing is turned.
+        let whole = picture(Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.0 });
+        assert_eq!(starts(&Picture { distance: Some(1.3), ..whole }).unwrap(), around84(1.3));
+    }
 
     #[test]
     fn unexplained_is_relative_to_an_empty_picture() {
         let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pixel_center: 0.0 };
         let of = |rgb: &[f32], weights: Option<&[f32]>, render: &[f32]| {
             let (rgb, weights) = (rgb.to_vec(), weights.map(<[f32]>::to_vec));
-            let picture =
-                Picture { name: String::new(), instance: 0, rgb, weights, intrinsics, truth: None, square: ([0; 2], 1) };
+            let picture = Picture { rgb, weights, ..picture(intrinsics) };
             unexplained(&picture, render)
         };
         let picture = [0.5, 1.0, -0.5];
