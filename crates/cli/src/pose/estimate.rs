@@ -8,10 +8,10 @@ use glam::DMat4;
 use serde::Serialize;
 use sigma_srn::{Engine, Model};
 
-use super::files::{CameraArgs, Picture, PoseSource, create_dir, load_model, model_side, print, refuse_existing};
+use super::files::{CameraArgs, Picture, PoseSource, create_dir, model_side};
 use super::record::Log;
 use super::search::{Found, PoseError, SearchArgs, Starts};
-use crate::common::{EngineArgs, Result, progress};
+use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
 
 /// Flags of `sigma-pose estimate`.
 #[derive(Args, Debug)]
