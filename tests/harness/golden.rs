@@ -175,7 +175,15 @@ fn relative_difference(got: &[f32], want: &[f32]) -> f64 {
 
 /// Computes everything that the file holds and returns the worst figure per quantity.
 pub fn check(engine: &Engine, path: &Path, limits: Limits) -> Result<Vec<Figure>, String> {
-    let mut golden = Golden::read(path)?;
+    check_all(engine, Golden::read(path)?, limits)
+}
+
+/// The same with the weights from elsewhere.
+pub fn check_model(engine: &Engine, path: &Path, model: Model, limits: Limits) -> Result<Vec<Figure>, String> {
+    check_all(engine, Golden { model, ..Golden::read(path)? }, limits)
+}
+
+fn check_all(engine: &Engine, mut golden: Golden, limits: Limits) -> Result<Vec<Figure>, String> {
     let mut figures = measure(engine, &golden, limits)?;
     if limits.output > Limits::F64.output && figures.iter().any(|figure| !figure.passes()) {
         let exact = golden.model.parameters.clone();

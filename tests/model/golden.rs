@@ -3,16 +3,23 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use sigma_srn::Engine;
-use srn_tests::golden::{Figure, Limits, check};
+use sigma_srn::{Engine, Metadata, Model};
+use srn_tests::golden::{Figure, Limits, check, check_model};
 use srn_tests::gpu;
 
 fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("golden")
 }
 
+fn path(file: &str, kind: &str) -> PathBuf {
+    folder().join(file).with_extension(kind)
+}
+
 fn passes(file: &str, engine: Engine, limits: Limits) {
-    let figures = check(&engine, &folder().join(file).with_extension("safetensors"), limits).unwrap();
+    report(file, &engine, check(&engine, &path(file, "safetensors"), limits).unwrap());
+}
+
+fn report(file: &str, engine: &Engine, figures: Vec<Figure>) {
     let lines: Vec<String> = figures.iter().map(|figure| format!("{file} on {engine}: {figure}")).collect();
     println!("{}", lines.join("\n"));
     assert!(figures.iter().all(Figure::passes), "{}", lines.join("\n"));
@@ -44,6 +51,22 @@ macro_rules! files {
 }
 
 files! { tiny small small_srn clamped }
+
+/// `small.pth` and `tiny.pth`: the same weights as parameters of nested modules, saved by PyTorch 2.15 with
+/// `torch.save({"model": module.state_dict(), "optimizer": adam.state_dict()}, path)`, the latter in the format before 1.6. Two
+/// parameters share a storage, one lies in memory column by column, and Adam has done a step on the codes.
+#[test]
+fn checkpoints_of_torch_are_the_same_models() {
+    for file in ["small", "tiny"] {
+        let (model, left_out) = Model::load_torch(&path(file, "pth"), 10, Metadata::default()).unwrap();
+        assert_eq!(left_out, [""; 0]);
+        let bytes = std::fs::read(path(file, "safetensors")).unwrap();
+        let golden = Model::from_bytes(&bytes, "model.", &path(file, "safetensors")).unwrap();
+        assert!(model.layout == golden.layout && model.parameters == golden.parameters, "{file}");
+        let engine = Engine::cpu_f64();
+        report(file, &engine, check_model(&engine, &path(file, "safetensors"), model, Limits::F64).unwrap());
+    }
+}
 
 #[test]
 fn no_file_is_left_out() {

@@ -19,7 +19,7 @@ fn tolerance(kernel: &Kernel) -> Option<f64> {
 }
 
 /// Executors that compare alike need plans that are alike: tiles of a part of an image, on both.
-fn engines() -> [Engine; 2] {
+pub fn engines() -> [Engine; 2] {
     [Engine::gpu(gpu().clone()), Engine::cpu_f64()].map(|engine| engine.with_tile_rows(RAYS - 20))
 }
 
@@ -28,7 +28,7 @@ fn stage(executor: &dyn Executor, name: &str) -> StageId {
     plan.stage_id(plan.stages.iter().position(|stage| stage.name == name).unwrap())
 }
 
-fn step_by_step(subject: &mut dyn Executor, reference: &mut dyn Executor, name: &str) -> BTreeMap<&'static str, f64> {
+pub fn step_by_step(subject: &mut dyn Executor, reference: &mut dyn Executor, name: &str) -> BTreeMap<&'static str, f64> {
     let stage = stage(reference, name);
     let worst = lockstep(subject, reference, stage, tolerance).unwrap_or_else(|divergence| panic!("{name}: {divergence}"));
     let largest = worst.iter().max_by(|a, b| a.1.total_cmp(b.1)).unwrap();
@@ -71,7 +71,7 @@ fn a_step_of_every_descent() {
 }
 
 /// After the same calls the inputs are the same up to rounding: now to the last digit.
-fn share_inputs(subject: &mut dyn Executor, reference: &mut dyn Executor) {
+pub fn share_inputs(subject: &mut dyn Executor, reference: &mut dyn Executor) {
     let plan = subject.plan().clone();
     for buffer in plan.buffers.iter().filter(|buffer| buffer.role == srn_plan::Role::Input) {
         let id = plan.find(&buffer.name).unwrap();

@@ -6,6 +6,7 @@ use sigma_srn::{
 };
 use srn_plan::{BufferId, Executor};
 
+mod baked;
 mod behaviour;
 mod finite_differences;
 mod golden;
@@ -21,7 +22,7 @@ const LOSSES: [Loss; 5] = [Loss::Mae, Loss::Mse, Loss::NormL1, Loss::NormL2, Los
 fn model(density: bool) -> Model {
     let config = ModelConfig { hidden: 12, latent: 5, instances: INSTANCES, tracing_steps: 3, density };
     let mut model = Model::init(&config, 5).unwrap();
-    let codes = model.layout.codes;
+    let codes = model.hypernetwork().unwrap().codes;
     model.parameters[codes].values.iter_mut().for_each(|value| *value *= 30.0);
     let step_head = model.layout.step_head.linear;
     *model.parameters[step_head].values.last_mut().unwrap() = -0.05;

@@ -1,7 +1,7 @@
 //! What the binaries share: choice of the executor, exit codes, data sets as the network takes them, progress.
 
 use std::error::Error;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use clap::{Args, ValueEnum};
 use glam::DMat4;
 use image::{Rgb, RgbImage};
 use indicatif::{ProgressBar, ProgressStyle};
-use sigma_srn::{Engine, Gpu, Intrinsics};
+use sigma_srn::{Engine, Gpu, Intrinsics, Model};
 use srn_data::camera::Axes;
 use srn_data::{Dataset, LoadedView, SrnSet, sheet};
 use tracing_subscriber::filter::{LevelFilter, Targets};
@@ -126,6 +126,33 @@ pub fn finish(result: Result<bool>) -> ExitCode {
             ExitCode::from(2)
         }
     }
+}
+
+/// Reads a model; every error names the file.
+pub fn load_model(path: &Path) -> Result<Model> {
+    Model::load(path).map_err(|error| about_model(path, error))
+}
+
+/// An error about the model in a file, with the file's name.
+pub fn about_model(path: &Path, error: sigma_srn::Error) -> Box<dyn Error + Send + Sync> {
+    match error {
+        error @ (sigma_srn::Error::Io { .. } | sigma_srn::Error::Format { .. }) => error.into(),
+        error => format!("{}: {error}", path.display()).into(),
+    }
+}
+
+/// Fails if one of the files is there already.
+pub fn refuse_existing(paths: impl IntoIterator<Item = PathBuf>, force: bool) -> Result<()> {
+    match paths.into_iter().find(|path| !force && path.exists()) {
+        Some(path) => Err(format!("{}: exists already; --force overwrites it", path.display()).into()),
+        None => Ok(()),
+    }
+}
+
+/// Prints a result on stdout; a full disk or a closed pipe is an error, not a panic.
+pub fn print(text: &str) -> Result<()> {
+    use std::io::Write;
+    writeln!(std::io::stdout(), "{text}").map_err(|error| format!("stdout: {error}").into())
 }
 
 /// Reads a set of SRN instance folders as squares of `side` pixels.

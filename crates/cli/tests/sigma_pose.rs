@@ -434,3 +434,35 @@ fn a_mask_takes_pixels_out_of_the_search() {
     image::GrayImage::new(8, 8).save(dir.join("small.png")).unwrap();
     fail_with("--fov 53.5 --instance seat --mask small.png", &["small.png", "8×8"]);
 }
+
+/// One object alone: the same picture, the same poses, wherever a model goes.
+#[test]
+fn a_baked_model_is_a_model() {
+    let home = home();
+    let dir = home.path();
+    let line = run(dir, "bake --model model.safetensors --instance chicken --out chicken.safetensors", 0);
+    assert!(line.contains("chicken.safetensors: chicken, 0.0"), "{line}");
+    let models = ["model", "chicken"];
+    let pictures = models.map(|model| {
+        run(dir, &format!("render --model {model}.safetensors --instance chicken --executor cpu --out {model}.png"), 0);
+        image::open(dir.join(model).with_extension("png")).unwrap().into_rgb8()
+    });
+    let apart = pictures[0].as_raw().iter().zip(pictures[1].as_raw()).map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(apart <= Some(1), "{apart:?}");
+    let poses = models.map(|model| {
+        let args = format!("estimate DATA/{CHICKEN} --model {model}.safetensors --executor cpu --steps 3 --json --accept 1e9");
+        let report: Value = serde_json::from_str(&run(dir, &args, 0)).unwrap();
+        matrix(&report["images"][0]["world_from_camera"])
+    });
+    let (rotation, translation) = pose_error(&poses[0], &poses[1]);
+    assert!(rotation < 0.01 && translation < 1e-4, "{rotation}° {translation}");
+    let evaluate = "evaluate --model chicken.safetensors --data DATA --views 1 --steps 2 --executor cpu";
+    assert!(run(dir, evaluate, 0).contains("chicken"));
+
+    let bake = "bake --model model.safetensors --instance";
+    fail(dir, &format!("{bake} seat --out chicken.safetensors"), &["chicken.safetensors", "exists already", "--force"]);
+    fail(dir, &format!("{bake} teapot --out teapot.safetensors"), &["model.safetensors", "teapot", "bucket, chicken, seat"]);
+    fail(dir, "bake --model chicken.safetensors --instance 0 --out more.safetensors", &["chicken.safetensors", "is baked"]);
+    run(dir, &format!("{bake} seat --out chicken.safetensors --force"), 0);
+    fail(dir, &format!("estimate DATA/{CHICKEN} --model chicken.safetensors"), &["`chicken`", "1 instances: seat"]);
+}

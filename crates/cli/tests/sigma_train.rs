@@ -10,6 +10,8 @@ use sigma_srn::Model;
 
 const TRAIN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/dataset/train");
 const TEST: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/dataset/test");
+/// A checkpoint by PyTorch of σSRN with 32 features and 3 codes of 16.
+const CHECKPOINT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/small.pth");
 
 /// A run of seconds.
 const TINY: &str = "--hidden 16 --latent 8 --tracing-steps 3 --side 16 --views 3 --batch 3 --rays 40 --log-every 1 \
@@ -256,11 +258,11 @@ fn adapt_fits_codes_alone() {
 
     let [old, adapted] = [&old, &new].map(|path| Model::load(path).unwrap());
     assert_eq!((adapted.metadata.instance_names.as_slice(), adapted.metadata.side), (&["seat".to_string()][..], Some(16)));
-    let codes = old.layout.codes;
+    let codes = old.hypernetwork().unwrap().codes;
     for (number, (before, after)) in old.parameters.iter().zip(&adapted.parameters).enumerate() {
         assert_eq!(before.values == after.values, number != codes, "{:?}", before.tensors);
     }
-    assert_ne!(old.with_new_instances(vec!["seat".into()]).parameters[codes], adapted.parameters[codes]);
+    assert_ne!(old.with_new_instances(vec!["seat".into()]).unwrap().parameters[codes], adapted.parameters[codes]);
 
     fail(&format!("{adapt} {}", new.display()), &["new.safetensors", "exists already"]);
     let other = at("other").display().to_string();
@@ -268,4 +270,51 @@ fn adapt_fits_codes_alone() {
     fail(&format!("{adapt} {other} --views 1000"), &["--views 1000", "seat"]);
     assert!(!at("other").exists());
     assert!(succeed(&format!("{adapt} {other} --view 000003")).contains("seat"));
+}
+
+#[test]
+fn checkpoints_of_torch_come_and_go() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name).display().to_string();
+    let (model, back, again, names) = (at("model.safetensors"), at("back.pth"), at("again.safetensors"), at("names.txt"));
+    fs::write(&names, "beetle\n\n mini\r\nvan\n").unwrap();
+    let import = format!("import {CHECKPOINT} --out {model} --names {names} --side 16 --tracing-steps 7 --radius 2");
+    let result: Value = serde_json::from_str(&succeed(&format!("{import} --json"))).unwrap();
+    for (key, number) in [("hidden", 32), ("latent", 16), ("instances", 3), ("tracing_steps", 7)] {
+        assert_eq!(result[key], number, "{key}");
+    }
+    assert_eq!((result["density"].as_bool(), result["left_out"].as_array().unwrap().len()), (Some(true), 0));
+    let imported = Model::load(Path::new(&model)).unwrap();
+    assert_eq!(imported.metadata.instance_names, ["beetle", "mini", "van"]);
+    assert_eq!((imported.metadata.side, imported.metadata.orbit_radius), (Some(16), Some(2.0)));
+    assert_eq!(imported.layout.tracing_steps, 7);
+
+    assert!(succeed(&format!("export {model} --out {back}")).contains("83 tensors"));
+    // What a checkpoint does not say is the paper's.
+    assert!(succeed(&format!("import {back} --out {again}")).contains("σSRN, 32 features, 3 codes of 16, 10 steps"));
+    let read_again = Model::load(Path::new(&again)).unwrap();
+    assert_eq!(read_again.parameters, imported.parameters);
+    assert_eq!((read_again.metadata.side, read_again.metadata.orbit_radius), (Some(64), Some(1.3)));
+    assert_eq!((read_again.layout.tracing_steps, read_again.metadata.instance_names.len()), (10, 0));
+
+    let before = fs::read(&model).unwrap();
+    fs::write(at("two.txt"), "beetle\nmini\n").unwrap();
+    let (baked, new, dir) = (at("baked.safetensors"), at("new"), dir.path().display());
+    imported.bake(1).unwrap().save(Path::new(&baked)).unwrap();
+    for (args, words) in [
+        (import.clone(), &["model.safetensors", "exists already", "--force"][..]),
+        (format!("export {model} --out {back}"), &["back.pth", "exists already"]),
+        (format!("import {model} --out {new}"), &["model.safetensors", "not a file of torch.save"]),
+        (format!("import {CHECKPOINT} --out {new} --names {dir}/two.txt"), &["small.pth", "2 for 3"]),
+        (format!("import {CHECKPOINT} --out {new} --names {dir}/none.txt"), &["none.txt"]),
+        (format!("import {CHECKPOINT} --out {new} --tracing-steps 0"), &["--tracing-steps"]),
+        (format!("export {back} --out {new}"), &["back.pth", "safetensors"]),
+        (format!("export {baked} --out {new}"), &["baked.safetensors", "is baked"]),
+        (format!("adapt --model {baked} --data {TEST}/seat --out {new}"), &["baked.safetensors", "is baked"]),
+    ] {
+        fail(&args, words);
+        assert!(!Path::new(&new).exists(), "{args}");
+    }
+    assert!(fs::read(&model).unwrap() == before);
+    succeed(&format!("{import} --force"));
 }

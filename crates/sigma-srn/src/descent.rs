@@ -10,7 +10,7 @@ use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, Tile, tiles};
 use crate::camera::{Pose6, from_rows, to_rows};
 use crate::engine::{Engine, Runner};
 use crate::model::Model;
-use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, Started, Trainable, backward, forward};
+use crate::network::{Batch, Network, Purpose, Saved, Scratch, Started, Trainable, backward, forward};
 use crate::rays::wanted;
 use crate::{Error, Rays};
 
@@ -338,12 +338,10 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, method: Method, tile_rows
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
     let saved = Saved::new(b, &network, Purpose::Pose, most)?;
     let scratch = Scratch::new(b, &network, &saved)?;
-    let hyper_saved = HyperSaved::new(b, &network)?;
     let gmsd = matches!(method, Method::Adam { loss: Loss::Gmsd, .. });
     let target = b.input("target", if gmsd { 3 } else { 4 } * hypotheses as usize * rays_per_image as usize)?;
 
-    let instances = b.stage("instances");
-    forward::hypernetwork(b, &network, &hyper_saved)?;
+    let instances = forward::instances(b, &network)?;
 
     let loss = match method {
         Method::Adam { loss, .. } => loss.per_pixel(),

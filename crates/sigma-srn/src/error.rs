@@ -13,8 +13,8 @@ pub enum Error {
         /// What the system said.
         source: std::io::Error,
     },
-    /// A model file that is not safetensors.
-    #[error("{}: not a safetensors file: {what}", path.display())]
+    /// A model file that is of no known format, or broken, or does not fit.
+    #[error("{}: {what}", path.display())]
     Format {
         /// The file.
         path: PathBuf,

@@ -16,6 +16,7 @@ mod network;
 mod random;
 mod rays;
 mod renderer;
+mod torch;
 mod trainer;
 
 pub use camera::{Intrinsics, Pose6};
@@ -23,7 +24,7 @@ pub use descent::{Descent, Loss, Method, Shape};
 pub use engine::Engine;
 pub use error::Error;
 pub use estimator::{Estimate, Options, Phase, Progress, Query, Ranked, estimate};
-pub use model::{Block, Kind, Layout, Metadata, Model, ModelConfig, Parameter, write_atomically};
+pub use model::{Block, Hypernetwork, Kind, Layout, Metadata, Model, ModelConfig, Parameter, Source, write_atomically};
 pub use random::{Random, stream};
 pub use rays::{Rays, pixel_grid};
 pub use renderer::{Renderer, Rendering};

@@ -4,10 +4,11 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use rand::RngExt;
+use safetensors::SafeTensorError;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
-use crate::Error;
 use crate::random::{Random, normal, stream};
+use crate::{Error, renderer};
 
 /// Sizes of a model that is made from nothing. A loaded model takes them from its tensors.
 #[derive(Clone, Debug, PartialEq)]
@@ -37,20 +38,36 @@ pub struct Block {
     pub out_features: u32,
 }
 
-/// Which parameter is what.
+/// From an instance's code to the weights of the scene MLP.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Layout {
+pub struct Hypernetwork {
     /// Latent codes `[instances, latent]`.
     pub codes: usize,
     /// Length of a code.
     pub latent: u32,
-    /// Number of codes.
+    /// One MLP per layer of the scene MLP.
+    pub layers: Vec<Vec<Block>>,
+}
+
+/// Where the weights of the scene MLP f come from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Source {
+    /// Made from the instance's code.
+    Hypernetwork(Hypernetwork),
+    /// Stored, those of the one instance that the model knows ([`Model::bake`]): one parameter per layer.
+    Baked(Vec<usize>),
+}
+
+/// Which parameter is what.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layout {
+    /// Number of instances: latent codes, or 1.
     pub instances: u32,
     /// Marching steps M.
     pub tracing_steps: u32,
-    /// The hypernetwork: one MLP per layer of the scene MLP.
-    pub hyper: Vec<Vec<Block>>,
-    /// The scene MLP f as `(in, out)` per layer; its parameters are the hypernetwork's outputs.
+    /// Where the weights of f come from.
+    pub source: Source,
+    /// The scene MLP f as `(in, out)` per layer.
     pub scene: Vec<(u32, u32)>,
     /// LSTM, input to gates.
     pub lstm_input: Block,
@@ -138,7 +155,9 @@ impl Shapes for Tensors {
     }
 }
 
+const CODES: &str = "latent_codes.weight";
 const HYPER: &str = "hyper_phi.layers";
+const BAKED: &str = "phi.layers";
 const SCENE_INPUT: u32 = 3;
 
 impl Shapes for ModelConfig {
@@ -164,10 +183,10 @@ impl Shapes for ModelConfig {
                 _ => None,
             }
         };
-        if name == "latent_codes.weight" {
+        if name == CODES {
             return Some(vec![self.instances as usize, latent]);
         }
-        if let Some(rest) = name.strip_prefix("hyper_phi.layers.") {
+        if let Some(rest) = name.strip_prefix(HYPER).and_then(|rest| rest.strip_prefix('.')) {
             let (layer, rest) = rest.split_once(".hyper_linear.hypo_params.net.")?;
             let layer: usize = layer.parse().ok().filter(|&layer: &usize| layer < SCENE_LAYERS)?;
             let input = if layer == 0 { SCENE_INPUT as usize } else { hidden };
@@ -248,34 +267,58 @@ impl Collector<'_> {
             blocks.push(block);
         }
     }
+
+    /// Codes and hypernetwork; also the number of codes, and the layers that it makes.
+    fn hypernetwork(&mut self) -> Result<(Hypernetwork, u32, Vec<(u32, u32)>), Error> {
+        let shape = self.shape(CODES, 2)?;
+        let (instances, latent) = (shape[0] as u32, shape[1] as u32);
+        let codes = self.push(Kind::Codes, vec![(CODES.into(), shape)]);
+        let mut layers = Vec::new();
+        let mut scene = Vec::new();
+        let mut width = SCENE_INPUT;
+        loop {
+            let prefix = format!("{HYPER}.{}.hyper_linear.hypo_params.net", layers.len());
+            let first = ["net.0.weight", "weight"].map(|name| self.shapes.shape(&format!("{prefix}.0.{name}")));
+            if first == [None, None] && !layers.is_empty() {
+                return Ok((Hypernetwork { codes, latent, layers }, instances, scene));
+            }
+            let blocks = self.mlp(Kind::HyperOutput, &prefix, latent)?;
+            let emitted = blocks.last().expect("an MLP has a last layer").out_features;
+            if emitted % (width + 1) != 0 {
+                let expected = format!("in · out + out values for a layer with {width} inputs");
+                return Err(Error::Tensor { name: format!("{prefix} (last layer)"), expected, got: emitted.to_string() });
+            }
+            scene.push((width, emitted / (width + 1)));
+            width = emitted / (width + 1);
+            layers.push(blocks);
+        }
+    }
+
+    /// The stored layers of a baked model's scene MLP.
+    fn baked(&mut self) -> Result<Vec<Block>, Error> {
+        let mut layers: Vec<Block> = Vec::new();
+        loop {
+            let [weight, bias] = ["weight", "bias"].map(|kind| format!("{BAKED}.{}.{kind}", layers.len()));
+            if self.shapes.shape(&weight).is_none() {
+                return Ok(layers);
+            }
+            let width = layers.last().map_or(SCENE_INPUT, |layer| layer.out_features);
+            layers.push(self.linear(Kind::Linear, &weight, &bias, width)?);
+        }
+    }
 }
 
 fn collect(shapes: &dyn Shapes, tracing_steps: u32) -> Result<(Layout, Vec<Parameter>), Error> {
     let mut collector = Collector { shapes, parameters: Vec::new() };
-    let codes_name = "latent_codes.weight";
-    let codes_shape = collector.shape(codes_name, 2)?;
-    let (instances, latent) = (codes_shape[0] as u32, codes_shape[1] as u32);
-    let codes = collector.push(Kind::Codes, vec![(codes_name.into(), codes_shape)]);
-
-    let mut hyper = Vec::new();
-    let mut scene = Vec::new();
-    let mut width = SCENE_INPUT;
-    loop {
-        let prefix = format!("{HYPER}.{}.hyper_linear.hypo_params.net", hyper.len());
-        let is_there = shapes.shape(&format!("{prefix}.0.net.0.weight")).or_else(|| shapes.shape(&format!("{prefix}.0.weight")));
-        if is_there.is_none() && !hyper.is_empty() {
-            break;
-        }
-        let blocks = collector.mlp(Kind::HyperOutput, &prefix, latent)?;
-        let emitted = blocks.last().expect("an MLP has a last layer").out_features;
-        if emitted % (width + 1) != 0 {
-            let expected = format!("in · out + out values for a layer with {width} inputs");
-            return Err(Error::Tensor { name: format!("{prefix} (last layer)"), expected, got: emitted.to_string() });
-        }
-        scene.push((width, emitted / (width + 1)));
-        width = emitted / (width + 1);
-        hyper.push(blocks);
-    }
+    let baked = collector.baked()?;
+    let (source, instances, scene) = if baked.is_empty() {
+        let (hypernetwork, instances, scene) = collector.hypernetwork()?;
+        (Source::Hypernetwork(hypernetwork), instances, scene)
+    } else {
+        let scene = baked.iter().map(|layer| (layer.in_features, layer.out_features)).collect();
+        (Source::Baked(baked.iter().map(|layer| layer.linear).collect()), 1, scene)
+    };
+    let width = scene.last().map_or(SCENE_INPUT, |layer| layer.1);
 
     let lstm = |part: &str| format!("ray_marcher.lstm.{part}");
     let lstm_input = collector.linear(Kind::Lstm, &lstm("weight_ih"), &lstm("bias_ih"), width)?;
@@ -288,19 +331,7 @@ fn collect(shapes: &dyn Shapes, tracing_steps: u32) -> Result<(Layout, Vec<Param
     let has_density = shapes.shape("sigma.net.0.net.0.weight").or_else(|| shapes.shape("sigma.net.0.weight")).is_some();
     let density = has_density.then(|| collector.mlp(Kind::Linear, "sigma.net", SCENE_INPUT)).transpose()?;
     let pixel_generator = collector.mlp(Kind::Linear, "pixel_generator.net", width)?;
-    let layout = Layout {
-        codes,
-        latent,
-        instances,
-        tracing_steps,
-        hyper,
-        scene,
-        lstm_input,
-        lstm_hidden,
-        step_head,
-        density,
-        pixel_generator,
-    };
+    let layout = Layout { instances, tracing_steps, source, scene, lstm_input, lstm_hidden, step_head, density, pixel_generator };
     Ok((layout, collector.parameters))
 }
 
@@ -334,15 +365,15 @@ impl Model {
     /// Reads a model from the bytes of a safetensors file, from the tensors whose names begin with `prefix`.
     pub fn from_bytes(bytes: &[u8], prefix: &str, path: &Path) -> Result<Self, Error> {
         let format = |what: String| Error::Format { path: path.into(), what };
-        let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| format(error.to_string()))?;
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| not_safetensors(path, error))?;
         let text = header.metadata().clone().unwrap_or_default();
-        let file = SafeTensors::deserialize(bytes).map_err(|error| format(error.to_string()))?;
+        let file = SafeTensors::deserialize(bytes).map_err(|error| not_safetensors(path, error))?;
         let mut tensors = Tensors::new();
         for (name, view) in file.tensors() {
             if let Some(name) = name.strip_prefix(prefix) {
                 if view.dtype() == Dtype::F32 {
                     tensors.insert(name.to_string(), (view.shape().to_vec(), floats(&view)));
-                } else if name.starts_with("hyper_phi") || name.starts_with("latent_codes") {
+                } else if [CODES, HYPER, BAKED].iter().any(|part| name.starts_with(part)) {
                     let got = format!("{:?}", view.dtype());
                     return Err(Error::Tensor { name: name.into(), expected: "F32".into(), got });
                 }
@@ -353,7 +384,18 @@ impl Model {
             Some(Ok(steps)) if steps >= 1.0 && steps.fract() == 0.0 => steps as u32,
             _ => return Err(format("metadata `tracing_steps` must be a whole number of at least 1".into())),
         };
-        let (layout, mut parameters) = collect(&tensors, tracing_steps)?;
+        let instance_names: Vec<String> = match text.get("instance_names") {
+            Some(names) => serde_json::from_str(names).map_err(|error| format(format!("metadata `instance_names`: {error}")))?,
+            None => Vec::new(),
+        };
+        let side = number("side").and_then(Result::ok).map(|side| side as u32);
+        let metadata = Metadata { instance_names, side, orbit_radius: number("orbit_radius").and_then(Result::ok) };
+        Self::from_tensors(&tensors, tracing_steps, metadata)
+    }
+
+    /// A model of named tensors. Sizes come from them; what is no part of a model is left out.
+    pub(crate) fn from_tensors(tensors: &Tensors, tracing_steps: u32, metadata: Metadata) -> Result<Self, Error> {
+        let (layout, mut parameters) = collect(tensors, tracing_steps)?;
         for parameter in &mut parameters {
             for (name, _) in &parameter.tensors {
                 let values = &tensors[name].1;
@@ -364,16 +406,39 @@ impl Model {
                 parameter.values.extend(values);
             }
         }
-        let instance_names: Vec<String> = match text.get("instance_names") {
-            Some(names) => serde_json::from_str(names).map_err(|error| format(format!("metadata `instance_names`: {error}")))?,
-            None => Vec::new(),
-        };
-        if !instance_names.is_empty() && instance_names.len() != layout.instances as usize {
-            return Err(format(format!("{} instance names for {} codes", instance_names.len(), layout.instances)));
+        let names = metadata.instance_names.len();
+        if names != 0 && names != layout.instances as usize {
+            let what = format!("{names} for {} instances", layout.instances);
+            return Err(Error::Input { input: "instance names".into(), what });
         }
-        let side = number("side").and_then(Result::ok).map(|side| side as u32);
-        let metadata = Metadata { instance_names, side, orbit_radius: number("orbit_radius").and_then(Result::ok) };
         Ok(Model { layout, parameters, metadata })
+    }
+
+    /// One instance's networks without codes and hypernetwork: a model with the weights of f that the hypernetwork makes for it.
+    pub fn bake(&self, instance: u32) -> Result<Self, Error> {
+        self.hypernetwork()?;
+        let is_shared = |name: &str| name != CODES && !name.starts_with(HYPER);
+        let shared = self.tensors().into_iter().filter(|(name, ..)| is_shared(name));
+        let mut tensors: Tensors = shared.map(|(name, shape, values)| (name, (shape, values.to_vec()))).collect();
+        let weights = renderer::scene_weights(self, instance)?;
+        for ((l, &(width, out)), mut weight) in self.layout.scene.iter().enumerate().zip(weights) {
+            let bias = weight.split_off((width * out) as usize);
+            tensors.insert(format!("{BAKED}.{l}.weight"), (vec![out as usize, width as usize], weight));
+            tensors.insert(format!("{BAKED}.{l}.bias"), (vec![out as usize], bias));
+        }
+        let metadata = Metadata { instance_names: vec![self.instance_name(instance)], ..self.metadata.clone() };
+        Self::from_tensors(&tensors, self.layout.tracing_steps, metadata)
+    }
+
+    /// Codes and hypernetwork; an error where the model is baked.
+    pub fn hypernetwork(&self) -> Result<&Hypernetwork, Error> {
+        match &self.layout.source {
+            Source::Hypernetwork(hypernetwork) => Ok(hypernetwork),
+            Source::Baked(_) => Err(Error::Input {
+                input: "the model is baked".into(),
+                what: "it has the networks of one instance, but neither codes nor a hypernetwork".into(),
+            }),
+        }
     }
 
     /// Writes a safetensors file, by way of a temporary file beside it: a crash leaves the old one whole.
@@ -401,9 +466,11 @@ impl Model {
             ("tracing_steps".into(), self.layout.tracing_steps.to_string()),
             ("density".into(), self.layout.density.is_some().to_string()),
             ("hidden".into(), self.layout.features().to_string()),
-            ("latent".into(), self.layout.latent.to_string()),
             ("instances".into(), self.layout.instances.to_string()),
         ]);
+        if let Source::Hypernetwork(hypernetwork) = &self.layout.source {
+            text.insert("latent".into(), hypernetwork.latent.to_string());
+        }
         if !self.metadata.instance_names.is_empty() {
             text.insert("instance_names".into(), serde_json::json!(self.metadata.instance_names).to_string());
         }
@@ -432,10 +499,11 @@ impl Model {
     }
 
     /// The same networks with `names.len()` fresh latent codes, each the mean of the old ones (two-shot fit, spec 4).
-    pub fn with_new_instances(&self, names: Vec<String>) -> Self {
+    pub fn with_new_instances(&self, names: Vec<String>) -> Result<Self, Error> {
+        let hypernetwork = self.hypernetwork()?;
+        let latent = hypernetwork.latent as usize;
         let mut model = self.clone();
-        let latent = self.layout.latent as usize;
-        let codes = &mut model.parameters[self.layout.codes];
+        let codes = &mut model.parameters[hypernetwork.codes];
         let old = codes.values.chunks_exact(latent);
         let count = old.len() as f32;
         let mean: Vec<f32> = (0..latent).map(|k| old.clone().map(|code| code[k]).sum::<f32>() / count).collect();
@@ -443,7 +511,7 @@ impl Model {
         codes.tensors[0].1 = vec![names.len(), latent];
         model.layout.instances = names.len() as u32;
         model.metadata.instance_names = names;
-        model
+        Ok(model)
     }
 }
 
@@ -482,6 +550,10 @@ fn floats(view: &TensorView) -> Vec<f32> {
     view.data().chunks_exact(4).map(|bytes| f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])).collect()
 }
 
+fn not_safetensors(path: &Path, error: SafeTensorError) -> Error {
+    Error::Format { path: path.into(), what: format!("not a safetensors file: {error}") }
+}
+
 /// Writes named tensors to `path` by way of a temporary file beside it.
 pub(crate) fn write_tensors(
     path: &Path,
@@ -495,8 +567,7 @@ pub(crate) fn write_tensors(
             (name.as_str(), TensorView::new(Dtype::F32, shape.clone(), bytes).expect("a parameter fills its shape"))
         })
         .collect();
-    let format = |error: safetensors::SafeTensorError| Error::Format { path: path.into(), what: error.to_string() };
-    let bytes = safetensors::serialize(views, Some(metadata)).map_err(format)?;
+    let bytes = safetensors::serialize(views, Some(metadata)).map_err(|error| not_safetensors(path, error))?;
     write_atomically(path, &bytes)
 }
 
@@ -515,9 +586,8 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), Error> {
 /// Tensors and metadata of a file.
 pub(crate) fn read_tensors(path: &Path) -> Result<(Tensors, HashMap<String, String>), Error> {
     let bytes = std::fs::read(path).map_err(|source| Error::Io { path: path.into(), source })?;
-    let format = |error: safetensors::SafeTensorError| Error::Format { path: path.into(), what: error.to_string() };
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
-    let file = SafeTensors::deserialize(&bytes).map_err(format)?;
+    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| not_safetensors(path, error))?;
+    let file = SafeTensors::deserialize(&bytes).map_err(|error| not_safetensors(path, error))?;
     let floats = file.tensors().into_iter().filter(|(_, view)| view.dtype() == Dtype::F32);
     let tensors = floats.map(|(name, view)| (name, (view.shape().to_vec(), self::floats(&view)))).collect();
     Ok((tensors, header.metadata().clone().unwrap_or_default()))

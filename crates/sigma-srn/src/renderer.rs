@@ -8,7 +8,7 @@ use srn_plan::{BufferId, Builder, PlanError, StageId, tiles};
 use crate::camera::Intrinsics;
 use crate::engine::{Engine, Runner};
 use crate::model::Model;
-use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Trainable, forward};
+use crate::network::{Batch, Network, Purpose, Saved, Trainable, forward};
 use crate::random::stream;
 use crate::{Error, Rays, pixel_grid};
 
@@ -71,24 +71,30 @@ impl Renderer {
 
     /// Sets what [`Renderer::encode`] renders.
     pub fn set_views(&mut self, instances: &[u32], cameras: &[(DMat4, Intrinsics)], seed: u64) -> Result<(), Error> {
-        let network = &self.handles.network;
         for (input, got) in [("instances", instances.len()), ("cameras", cameras.len())] {
             if got != self.views as usize {
                 let what = format!("got {got}, this renderer makes {} views", self.views);
                 return Err(Error::Input { input: input.into(), what });
             }
         }
-        if let Some(instance) = instances.iter().find(|&&instance| instance >= network.instances) {
-            let what = format!("number {instance}, but the model has {}", network.instances);
-            return Err(Error::Input { input: "instances".into(), what });
-        }
+        self.set_instances(instances)?;
         let mut random = stream(seed, 0);
         let mut rays = Rays::default();
         for (world_from_camera, intrinsics) in cameras {
             rays.push(world_from_camera, intrinsics, pixel_grid(self.width, self.height, 1), &mut random);
         }
+        let network = &self.handles.network;
         self.runner.write_f64(network.world_from_camera, rays.world_from_camera.as_flattened())?;
-        rays.write(&mut *self.runner, network)?;
+        Ok(rays.write(&mut *self.runner, network)?)
+    }
+
+    /// Makes the weights of f for the instance of each view, where they are not those of the last call.
+    fn set_instances(&mut self, instances: &[u32]) -> Result<(), Error> {
+        let network = &self.handles.network;
+        if let Some(instance) = instances.iter().find(|&&instance| instance >= network.instances) {
+            let what = format!("number {instance}, but the model has {}", network.instances);
+            return Err(Error::Input { input: "instances".into(), what });
+        }
         if self.instances.as_deref() != Some(instances) {
             self.runner.write_u32(network.index, instances)?;
             self.runner.run(self.handles.instances)?;
@@ -132,16 +138,22 @@ impl Renderer {
     }
 }
 
+/// The weights of each layer of f for an instance, `out·in + out` values, computed in `f64`.
+pub(crate) fn scene_weights(model: &Model, instance: u32) -> Result<Vec<Vec<f32>>, Error> {
+    let mut renderer = Renderer::new(&Engine::cpu_f64(), model, 1, 1, 1)?;
+    renderer.set_instances(&[instance])?;
+    let Renderer { runner, handles, .. } = &mut renderer;
+    handles.network.scene.iter().map(|block| Ok(runner.read(block.layer.weights)?)).collect()
+}
+
 fn build(b: &mut Builder, model: &Model, views: u32, [width, height]: [u32; 2], tile_rows: u32) -> Result<Handles, PlanError> {
     let rays = width * height;
     let network = Network::new(b, model, Batch { images: views, rays, slots: views }, Trainable::Nothing, true)?;
     let cut = tiles(views, rays, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
     let saved = Saved::new(b, &network, Purpose::Render, most)?;
-    let hyper_saved = HyperSaved::new(b, &network)?;
     let packed = b.scratch_u32("packed rgba8", (pack_rgba8::stride(width) * height) as usize)?;
-    let instances = b.stage("instances");
-    forward::hypernetwork(b, &network, &hyper_saved)?;
+    let instances = forward::instances(b, &network)?;
     let render = b.stage("render");
     for &tile in &cut {
         forward::render(b, &network, &saved, tile)?;

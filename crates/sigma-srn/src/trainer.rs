@@ -9,7 +9,7 @@ use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, tiles};
 use crate::engine::{Engine, Runner};
 use crate::model::{Model, Tensors, read_tensors, write_tensors};
 use crate::network::backward::{self, HyperScratch};
-use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, Started, Trainable, forward};
+use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, SourceBuffers, Started, Trainable, forward};
 use crate::rays::wanted;
 use crate::{Error, Rays};
 
@@ -94,6 +94,7 @@ impl Trainer {
                 return Err(Error::Setting { field, what: "must be at least 1".into() });
             }
         }
+        model.hypernetwork()?;
         let features = model.layout.features();
         let (plan, handles) = engine.fit(images * rays, features, |b, tile_rows| build(b, &model, train, batch, tile_rows))?;
         let mut runner = engine.prepare(plan)?;
@@ -242,9 +243,10 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
     let saved = Saved::new(b, &network, Purpose::Train, most)?;
     let scratch = Scratch::new(b, &network, &saved)?;
-    let hyper_saved = HyperSaved::new(b, &network)?;
-    let hyper_scratch = HyperScratch::new(b, &network)?;
-    let codes_count = batch.slots * network.latent;
+    let SourceBuffers::Hypernetwork(hyper) = &network.source else { unreachable!("a trainer takes no baked model") };
+    let hyper_saved = HyperSaved::new(b, &network, hyper)?;
+    let hyper_scratch = HyperScratch::new(b, &network, hyper)?;
+    let codes_count = batch.slots * hyper.latent;
     let partial_len = cut.iter().map(|tile| backward::partial_len(&network, tile.rows)).max().unwrap_or(1);
     let sums =
         image_loss::partial_len(images, rays).max(depth_loss::partial_len(rows)).max(latent_loss::partial_len(codes_count));
@@ -258,7 +260,7 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
 
     let gradients = b.stage("gradients");
     let mut started = Started::default();
-    forward::hypernetwork(b, &network, &hyper_saved)?;
+    forward::hypernetwork(b, &network, hyper, &hyper_saved)?;
     for &tile in &cut {
         forward::render(b, &network, &saved, tile)?;
         tile_ops::gather(b, tile, 4, target, tile_target)?;
@@ -268,10 +270,10 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
         depth::backward(b, tile.rows, scale, network.world_from_camera, saved.depth, scratch.d_origin)?;
         backward::render(b, &network, &saved, &scratch, partial, tile, d_rgb, true, &mut started)?;
     }
-    backward::hypernetwork(b, &network, &hyper_saved, &hyper_scratch, partial, &mut started)?;
+    backward::hypernetwork(b, &network, hyper, &hyper_saved, &hyper_scratch, partial, &mut started)?;
     let scale = (LATENT_WEIGHT / f64::from(codes_count)) as f32;
     latent_loss::backward(b, codes_count, scale, hyper_saved.z, hyper_scratch.d_z)?;
-    backward::codes(b, &network, hyper_scratch.d_z)?;
+    backward::codes(b, &network, hyper, hyper_scratch.d_z)?;
     image_loss::forward(b, image_loss::Kind::Mse, images, rays, network.rgb, target, count, partial, loss_images)?;
     latent_loss::forward(b, codes_count, 1.0 / codes_count as f32, hyper_saved.z, partial, loss_latent)?;
     depth_loss::forward(b, rows, 1.0 / rows as f32, network.depth, partial, loss_depth)?;

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use sigma_cli::common::finish;
-use sigma_cli::pose::{estimate, evaluate, render};
+use sigma_cli::pose::{bake, estimate, evaluate, render};
 
 /// Camera poses of pictures by gradient descent through a neural renderer.
 ///
@@ -24,6 +24,8 @@ enum Command {
     Evaluate(evaluate::Evaluate),
     /// Render an object from any side.
     Render(render::Render),
+    /// Write one object's networks to a small file of their own, which goes wherever a model goes but into training.
+    Bake(bake::Bake),
 }
 
 fn main() -> ExitCode {
@@ -31,5 +33,6 @@ fn main() -> ExitCode {
         Command::Estimate(args) => estimate::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Render(args) => render::run(&args),
+        Command::Bake(args) => bake::run(&args),
     })
 }

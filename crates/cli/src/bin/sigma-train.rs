@@ -1,10 +1,10 @@
-//! `sigma-train`: trains σSRN models on SRN data sets, and fits trained ones to new instances.
+//! `sigma-train`: trains σSRN models on SRN data sets, fits trained ones to new instances, exchanges them with PyTorch.
 
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use sigma_cli::common;
-use sigma_cli::train::{adapt, fit};
+use sigma_cli::train::{adapt, fit, torch};
 
 /// Trains σSRN models on SRN data sets.
 ///
@@ -22,11 +22,17 @@ enum Command {
     Fit(fit::FitArgs),
     /// Fit latent codes of new instances to a few views of each, all networks frozen.
     Adapt(adapt::AdaptArgs),
+    /// Make a model of a checkpoint of the authors' PyTorch code.
+    Import(torch::ImportArgs),
+    /// Make a checkpoint for that code of a model.
+    Export(torch::ExportArgs),
 }
 
 fn main() -> ExitCode {
     common::finish(match Cli::parse().command {
         Command::Fit(args) => fit::fit(&args),
         Command::Adapt(args) => adapt::adapt(&args),
+        Command::Import(args) => torch::import(&args),
+        Command::Export(args) => torch::export(&args),
     })
 }

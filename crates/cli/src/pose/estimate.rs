@@ -9,14 +9,12 @@ use serde::Serialize;
 use sigma_srn::{Engine, Model, Pose6};
 use srn_data::camera::Axes;
 
-use super::files::{
-    CameraArgs, Picture, PoseSource, create_dir, load_model, mask_of, model_side, print, refuse_existing, srn_instance,
-};
+use super::files::{CameraArgs, Picture, PoseSource, create_dir, mask_of, model_side, srn_instance};
 use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
 use super::search::{Found, PoseError, SearchArgs, Starts};
-use crate::common::{EngineArgs, Result, progress};
+use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
 
 /// Flags of `sigma-pose estimate`.
 #[derive(Args, Debug)]

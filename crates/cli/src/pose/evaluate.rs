@@ -10,10 +10,10 @@ use srn_data::sheet;
 use srn_data::srn::{InstanceFiles, SrnSet};
 
 use super::draw;
-use super::files::{Picture, create_dir, load_model, model_side, print, refuse_existing, write_png};
+use super::files::{Picture, create_dir, model_side, write_png};
 use super::notation::{Notation, NotationArgs};
 use super::search::{Found, PoseError, SearchArgs, Starts};
-use crate::common::{EngineArgs, Result, camera, progress};
+use crate::common::{EngineArgs, Result, camera, load_model, print, progress, refuse_existing};
 
 /// Side of a view on the sheet, pixels.
 const SHOWN: u32 = 128;

@@ -1,4 +1,4 @@
-//! What `sigma-pose` reads and writes: models, pictures with their cameras, PNG and GIF.
+//! What `sigma-pose` reads and writes: pictures with their cameras, PNG and GIF.
 
 use std::path::{Path, PathBuf};
 
@@ -18,14 +18,6 @@ use crate::common::Result;
 /// How long objects are in a picture, as a share of their diagonal: about that of a cube, of a ball in its box, and seen along the
 /// longest side.
 const SPAN: f64 = 0.8;
-
-/// Reads a model; every error names the file.
-pub fn load_model(path: &Path) -> Result<Model> {
-    Model::load(path).map_err(|error| match error {
-        sigma_srn::Error::MissingTensor { .. } | sigma_srn::Error::Tensor { .. } => format!("{}: {error}", path.display()).into(),
-        error => error.into(),
-    })
-}
 
 /// Flags that describe the camera; at most one of them.
 #[derive(Args, Clone, Debug)]
@@ -172,14 +164,6 @@ pub fn model_side(model: &Model, picture: &Path) -> Result<u32> {
     }
 }
 
-/// Fails if one of the files is there already.
-pub fn refuse_existing(paths: impl IntoIterator<Item = PathBuf>, force: bool) -> Result<()> {
-    match paths.into_iter().find(|path| !force && path.exists()) {
-        Some(path) => Err(format!("{}: exists already; --force overwrites it", path.display()).into()),
-        None => Ok(()),
-    }
-}
-
 /// Makes a folder with its parents.
 pub fn create_dir(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path).map_err(|error| format!("{}: {error}", path.display()).into())
@@ -204,10 +188,4 @@ pub fn write_gif(path: &Path, frames: impl IntoIterator<Item = (RgbImage, f64)>)
     }
     drop(encoder);
     Ok(write_atomically(path, &bytes)?)
-}
-
-/// Prints a result on stdout; a full disk or a closed pipe is an error, not a panic.
-pub fn print(text: &str) -> Result<()> {
-    use std::io::Write;
-    writeln!(std::io::stdout(), "{text}").map_err(|error| format!("stdout: {error}").into())
 }

@@ -1,5 +1,6 @@
 //! `sigma-pose`: poses of pictures, the paper's protocol on a data set, novel views.
 
+pub mod bake;
 mod draw;
 pub mod estimate;
 pub mod evaluate;

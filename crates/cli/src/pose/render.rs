@@ -11,11 +11,11 @@ use srn_data::pixels::rgb8;
 use srn_data::sheet::VIRIDIS;
 use srn_data::srn::{self, InstanceWriter, read_pose};
 
-use super::files::{CameraArgs, load_model, print, refuse_existing, write_gif, write_png};
+use super::files::{CameraArgs, write_gif, write_png};
 use super::notation::NotationArgs;
 use super::search::render;
 use super::{draw, positive};
-use crate::common::{EngineArgs, Result};
+use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
 
 /// Side of a view where neither the flags nor the model say it, pixels.
 const SIDE: u32 = 64;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use sigma_srn::{Model, Train, Trainer, stream};
+use sigma_srn::{Train, Trainer, stream};
 use srn_data::{Instance, LoadedView};
 
 use super::settings::{positive, up_to};
@@ -64,10 +64,11 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
     if args.out.parent().is_some_and(|folder| !folder.as_os_str().is_empty() && !folder.is_dir()) {
         return Err(format!("{out}: its folder does not exist").into());
     }
-    let model = Model::load(&args.model)?;
+    let model = common::load_model(&args.model)?;
     let side = args.side.or(model.metadata.side).ok_or("the model file names no image side; give --side")?;
     let set = common::load_set(&args.data, side)?;
     let model = model.with_new_instances(set.instances.iter().map(|instance| instance.name.clone()).collect());
+    let model = model.map_err(|error| common::about_model(&args.model, error))?;
     let split = set.instances.iter().map(|instance| split(args, instance)).collect::<Result<Vec<_>>>()?;
     let fitted: Vec<Shown> = (0..).zip(&split).flat_map(|(k, (fitted, _))| fitted.iter().map(move |&view| (k, view))).collect();
 

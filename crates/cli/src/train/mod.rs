@@ -1,8 +1,9 @@
-//! `sigma-train`: training from nothing, and the two-shot fit of new instances.
+//! `sigma-train`: training from nothing, the two-shot fit of new instances, and PyTorch checkpoints.
 
 pub mod adapt;
 pub mod fit;
 mod settings;
+pub mod torch;
 
 use rand::seq::index;
 use sigma_srn::{Engine, Model, Random, Rays, Renderer, Rendering, TrainingBatch, pixel_grid};

@@ -4,7 +4,7 @@ use srn_plan::ops::layer_norm_relu::Saved as NormSaved;
 use srn_plan::ops::{advance, density_sum, embedding, layer_norm_relu, linear, lstm_cell, rays};
 use srn_plan::{BufferId, Builder, PlanError, Rows, Tile};
 
-use super::{BlockBuffers, BlockSaved, HyperSaved, Network, Saved, Scratch, Started};
+use super::{BlockBuffers, BlockSaved, HyperBuffers, HyperSaved, Network, Saved, Scratch, SourceBuffers, Started};
 
 /// Partial sums of weight gradients: one buffer, large enough for every layer.
 pub(crate) fn partial_len(network: &Network, rows: Rows) -> usize {
@@ -13,8 +13,11 @@ pub(crate) fn partial_len(network: &Network, rows: Rows) -> usize {
     let blocks = network.scene.iter().chain(density).chain(&network.pixel_generator).chain(marcher);
     let tile = blocks.map(|block| block_partial_len(block, rows)).max().unwrap_or(0);
     let slots = Rows::plain(network.batch.slots);
-    let hyper = network.hyper.iter().flatten().map(|block| block_partial_len(block, slots)).max().unwrap_or(0);
-    tile.max(hyper).max(rays::partial_len(rows))
+    let hyper = match &network.source {
+        SourceBuffers::Hypernetwork(hyper) => hyper.layers.iter().flatten().map(|block| block_partial_len(block, slots)).max(),
+        SourceBuffers::Baked(_) => None,
+    };
+    tile.max(hyper.unwrap_or(0)).max(rays::partial_len(rows))
 }
 
 fn block_partial_len(block: &BlockBuffers, rows: Rows) -> usize {
@@ -185,6 +188,7 @@ fn weights(
 pub(crate) fn hypernetwork(
     b: &mut Builder,
     network: &Network,
+    hyper: &HyperBuffers,
     saved: &HyperSaved,
     scratch: &HyperScratch,
     partial: BufferId,
@@ -192,7 +196,7 @@ pub(crate) fn hypernetwork(
 ) -> Result<(), PlanError> {
     let rows = Rows::plain(network.batch.slots);
     let inside = Inside { d_y: scratch.d_y, d_z: scratch.d_hidden, partial };
-    for ((blocks, saved_blocks), scene) in network.hyper.iter().zip(&saved.mlps).zip(&network.scene) {
+    for ((blocks, saved_blocks), scene) in hyper.layers.iter().zip(&saved.mlps).zip(&network.scene) {
         let Some(d_weights) = scene.d_weights else { continue };
         let into = Into { buffer: scratch.d_z, accumulate: started.accumulate(scratch.d_z, 0) };
         mlp(b, network, rows, blocks, saved.z, saved_blocks, d_weights, inside, Some(into), started)?;
@@ -201,9 +205,9 @@ pub(crate) fn hypernetwork(
 }
 
 /// Gradient of the codes in the batch to the table of codes.
-pub(crate) fn codes(b: &mut Builder, network: &Network, d_z: BufferId) -> Result<(), PlanError> {
-    match network.d_parameters[0] {
-        Some(d_codes) => embedding::backward(b, network.embedding(), network.index, d_z, d_codes),
+pub(crate) fn codes(b: &mut Builder, network: &Network, hyper: &HyperBuffers, d_z: BufferId) -> Result<(), PlanError> {
+    match hyper.d_codes {
+        Some(d_codes) => embedding::backward(b, network.embedding(hyper), network.index, d_z, d_codes),
         None => Ok(()),
     }
 }
@@ -218,10 +222,10 @@ pub(crate) struct HyperScratch {
 }
 
 impl HyperScratch {
-    pub fn new(b: &mut Builder, network: &Network) -> Result<Self, PlanError> {
-        let hidden = network.hyper.iter().flatten().filter(|block| block.affine.is_some()).map(|block| block.layer.out_features);
+    pub fn new(b: &mut Builder, network: &Network, hyper: &HyperBuffers) -> Result<Self, PlanError> {
+        let hidden = hyper.layers.iter().flatten().filter(|block| block.affine.is_some()).map(|block| block.layer.out_features);
         let len = (network.batch.slots * hidden.max().unwrap_or(1)) as usize;
-        let d_z = b.scratch("d z of slots", (network.batch.slots * network.latent) as usize)?;
+        let d_z = b.scratch("d z of slots", (network.batch.slots * hyper.latent) as usize)?;
         Ok(HyperScratch { d_y: b.scratch("d y of hyper", len)?, d_hidden: b.scratch("d z of hyper", len)?, d_z })
     }
 }

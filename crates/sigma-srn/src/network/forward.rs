@@ -4,14 +4,40 @@ use srn_plan::ops::embedding::Embedding;
 use srn_plan::ops::layer_norm_relu::Saved as NormSaved;
 use srn_plan::ops::rays::Pixels;
 use srn_plan::ops::{advance, density_sum, depth, embedding, layer_norm_relu, linear, lstm_cell, rays, tile as tile_ops};
-use srn_plan::{BufferId, Builder, PlanError, Rows, Tile};
+use srn_plan::{BufferId, Builder, PlanError, Rows, StageId, Tile};
 
-use super::{BlockBuffers, BlockSaved, HyperSaved, Network, Saved};
+use super::{BlockBuffers, BlockSaved, HyperBuffers, HyperSaved, Network, Saved, SourceBuffers};
+
+/// The stage that makes the weights of f for each slot: by the hypernetwork, or as they are stored.
+pub(crate) fn instances(b: &mut Builder, network: &Network) -> Result<StageId, PlanError> {
+    match &network.source {
+        SourceBuffers::Hypernetwork(hyper) => {
+            let saved = HyperSaved::new(b, network, hyper)?;
+            let stage = b.stage("instances");
+            hypernetwork(b, network, hyper, &saved)?;
+            Ok(stage)
+        }
+        // A table with one row, each slot's index 0.
+        SourceBuffers::Baked(stored) => {
+            let stage = b.stage("instances");
+            for (&stored, scene) in stored.iter().zip(&network.scene) {
+                let table = Embedding { batch: network.batch.slots, instances: 1, latent: scene.layer.parameters() };
+                embedding::forward(b, table, stored, network.index, scene.layer.weights)?;
+            }
+            Ok(stage)
+        }
+    }
+}
 
 /// Codes of the slots, then one MLP per layer of f: code to weights.
-pub(crate) fn hypernetwork(b: &mut Builder, network: &Network, saved: &HyperSaved) -> Result<(), PlanError> {
-    embedding::forward(b, network.embedding(), network.codes(), network.index, saved.z)?;
-    for (blocks, saved_blocks) in network.hyper.iter().zip(&saved.mlps) {
+pub(crate) fn hypernetwork(
+    b: &mut Builder,
+    network: &Network,
+    hyper: &HyperBuffers,
+    saved: &HyperSaved,
+) -> Result<(), PlanError> {
+    embedding::forward(b, network.embedding(hyper), hyper.codes, network.index, saved.z)?;
+    for (blocks, saved_blocks) in hyper.layers.iter().zip(&saved.mlps) {
         mlp(b, Rows::plain(network.batch.slots), blocks, saved.z, network.index, saved_blocks)?;
     }
     Ok(())
@@ -74,12 +100,8 @@ fn mlp(
 }
 
 impl Network {
-    pub(super) fn embedding(&self) -> Embedding {
-        Embedding { batch: self.batch.slots, instances: self.instances, latent: self.latent }
-    }
-
-    pub(super) fn codes(&self) -> BufferId {
-        self.parameters[0]
+    pub(super) fn embedding(&self, hyper: &HyperBuffers) -> Embedding {
+        Embedding { batch: self.batch.slots, instances: self.instances, latent: hyper.latent }
     }
 
     pub(crate) fn pixels(&self, saved: &Saved) -> Pixels {

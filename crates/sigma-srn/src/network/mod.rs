@@ -12,7 +12,7 @@ use srn_plan::{BufferId, Builder, PlanError};
 
 pub(crate) use saved::{BlockSaved, HyperSaved, Saved, Scratch};
 
-use crate::model::{Block, Model};
+use crate::model::{Block, Hypernetwork, Model, Source};
 
 /// What the renderer will be used for; decides what the forward pass keeps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,12 +48,30 @@ pub(crate) struct BlockBuffers {
     pub d_affine: Option<BufferId>,
 }
 
+/// Codes and hypernetwork.
+#[derive(Debug)]
+pub(crate) struct HyperBuffers {
+    pub codes: BufferId,
+    /// Gradient of the codes, if wanted.
+    pub d_codes: Option<BufferId>,
+    pub latent: u32,
+    /// One MLP per layer of f.
+    pub layers: Vec<Vec<BlockBuffers>>,
+}
+
+/// Where the weights of f come from.
+#[derive(Debug)]
+pub(crate) enum SourceBuffers {
+    Hypernetwork(HyperBuffers),
+    /// Stored weights of each layer of f.
+    Baked(Vec<BufferId>),
+}
+
 /// The model's parameters, and what is shared by the whole batch, as buffers of a plan.
 #[derive(Debug)]
 pub(crate) struct Network {
     pub batch: Batch,
     pub tracing_steps: u32,
-    pub latent: u32,
     pub instances: u32,
     /// One buffer per parameter of the model, in its order.
     pub parameters: Vec<BufferId>,
@@ -71,7 +89,7 @@ pub(crate) struct Network {
     /// Results `[images·rays,3]` and `[images·rays]`.
     pub rgb: BufferId,
     pub depth: BufferId,
-    pub hyper: Vec<Vec<BlockBuffers>>,
+    pub source: SourceBuffers,
     pub scene: Vec<BlockBuffers>,
     pub lstm_input: BlockBuffers,
     pub lstm_hidden: BlockBuffers,
@@ -100,6 +118,10 @@ impl Network {
         pose_is_input: bool,
     ) -> Result<Self, PlanError> {
         let layout = &model.layout;
+        let codes = match &layout.source {
+            Source::Hypernetwork(hypernetwork) => Some(hypernetwork.codes),
+            Source::Baked(_) => None,
+        };
         let mut parameters = Vec::new();
         let mut d_parameters = Vec::new();
         for (number, parameter) in model.parameters.iter().enumerate() {
@@ -107,7 +129,7 @@ impl Network {
             parameters.push(b.input(name.clone(), len)?);
             let wanted = match trainable {
                 Trainable::Nothing => false,
-                Trainable::Codes => number == layout.codes,
+                Trainable::Codes => Some(number) == codes,
                 Trainable::Everything => true,
             };
             d_parameters.push(if wanted { Some(b.scratch(format!("d {name}"), len)?) } else { None });
@@ -148,7 +170,6 @@ impl Network {
         Ok(Network {
             batch,
             tracing_steps: layout.tracing_steps,
-            latent: layout.latent,
             instances: layout.instances,
             index: b.input_u32("instance of slot", batch.slots as usize)?,
             slots: b.input_u32("slot of image", images)?,
@@ -162,7 +183,15 @@ impl Network {
             z0: b.input("z0", rows)?,
             rgb: b.scratch("rgb", 3 * rows)?,
             depth: b.scratch("depth", rows)?,
-            hyper: layout.hyper.iter().map(blocks).collect(),
+            source: match &layout.source {
+                Source::Hypernetwork(Hypernetwork { codes, latent, layers }) => SourceBuffers::Hypernetwork(HyperBuffers {
+                    codes: parameters[*codes],
+                    d_codes: d_parameters[*codes],
+                    latent: *latent,
+                    layers: layers.iter().map(blocks).collect(),
+                }),
+                Source::Baked(stored) => SourceBuffers::Baked(stored.iter().map(|&number| parameters[number]).collect()),
+            },
             scene,
             lstm_input: block(&layout.lstm_input),
             lstm_hidden: block(&layout.lstm_hidden),

@@ -2,7 +2,7 @@
 
 use srn_plan::{BufferId, Builder, PlanError};
 
-use super::{BlockBuffers, Network, Purpose};
+use super::{BlockBuffers, HyperBuffers, Network, Purpose};
 
 /// What a layer leaves behind.
 #[derive(Clone, Copy, Debug)]
@@ -204,11 +204,11 @@ pub(crate) struct HyperSaved {
 
 impl HyperSaved {
     /// Adds the buffers; the last layer of each MLP writes the weights of f.
-    pub fn new(b: &mut Builder, network: &Network) -> Result<Self, PlanError> {
+    pub fn new(b: &mut Builder, network: &Network, hyper: &HyperBuffers) -> Result<Self, PlanError> {
         let slots = network.batch.slots as usize;
-        let z = b.scratch("z of slots", slots * network.latent as usize)?;
+        let z = b.scratch("z of slots", slots * hyper.latent as usize)?;
         let mut mlps = Vec::new();
-        for (l, (blocks, scene)) in network.hyper.iter().zip(&network.scene).enumerate() {
+        for (l, (blocks, scene)) in hyper.layers.iter().zip(&network.scene).enumerate() {
             let mut saved = Vec::new();
             for (k, block) in blocks.iter().enumerate() {
                 let len = slots * block.layer.out_features as usize;

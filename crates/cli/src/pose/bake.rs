@@ -1,0 +1,36 @@
+//! `sigma-pose bake`: one object's networks without the hypernetwork.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use crate::common::{Result, about_model, load_model, print, refuse_existing};
+
+/// Flags of `sigma-pose bake`.
+#[derive(Args, Debug)]
+pub struct Bake {
+    /// Model, or checkpoint of a training run.
+    #[arg(long, value_name = "FILE")]
+    model: PathBuf,
+    /// Name or number of the object.
+    #[arg(long, value_name = "NAME")]
+    instance: String,
+    /// The model to write: this object alone.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Overwrite what is there.
+    #[arg(long)]
+    force: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &Bake) -> Result<bool> {
+    refuse_existing([args.out.clone()], args.force)?;
+    let model = load_model(&args.model)?;
+    let about = |error| about_model(&args.model, error);
+    let baked = model.bake(model.instance(&args.instance).map_err(about)?).map_err(about)?;
+    baked.save(&args.out)?;
+    let bytes = std::fs::metadata(&args.out).map_err(|error| format!("{}: {error}", args.out.display()))?.len();
+    print(&format!("{}: {}, {:.2} MB", args.out.display(), baked.instance_name(0), bytes as f64 / 1e6))?;
+    Ok(true)
+}

@@ -1,0 +1,98 @@
+//! Baked models: one instance's networks do what the whole model does with that instance.
+
+use sigma_srn::{Descent, Engine, Error, Estimate, Method, Model, ModelConfig, Options, Query, Renderer, Shape, Train, Trainer};
+use sigma_srn::{camera, estimate};
+use srn_tests::{assert_close, difference, gpu};
+
+use crate::lockstep::{engines, share_inputs, step_by_step};
+use crate::{INSTANCES, RAYS, SIZE, batch, intrinsics, model, poses};
+
+/// The instance that is baked.
+const WHICH: u32 = 2;
+
+fn baked(density: bool) -> [(Model, u32); 2] {
+    let whole = model(density);
+    let baked = whole.bake(WHICH).unwrap();
+    [(whole, WHICH), (baked, 0)]
+}
+
+#[test]
+fn it_renders_the_same() {
+    let cameras: Vec<_> = poses(3).iter().map(|pose| (pose.to_matrix(), intrinsics())).collect();
+    for density in [true, false] {
+        // Weights are rounded once; how far that goes was measured: 3.5e-7 at most, on every engine.
+        for engine in [Engine::cpu_f64(), Engine::cpu(), Engine::gpu(gpu().clone())] {
+            let [whole, baked] = baked(density).map(|(model, instance)| {
+                Renderer::new(&engine, &model, 3, SIZE[0], SIZE[1]).unwrap().render(&[instance; 3], &cameras, 7).unwrap()
+            });
+            for (name, got, want) in [("rgb", baked.rgb, whole.rgb), ("depth", baked.depth, whole.depth)] {
+                println!("{engine}: {name} differs by {:.1e}", difference(&got, &want).unwrap());
+                assert_close(name, &got, &want, 2e-6);
+            }
+        }
+    }
+}
+
+#[test]
+fn it_finds_the_same_pose() {
+    let truth = poses(1)[0].to_matrix();
+    let engine = Engine::cpu();
+    let [(whole, instance), _] = baked(true);
+    let mut renderer = Renderer::new(&engine, &whole, 1, SIZE[0], SIZE[1]).unwrap();
+    let rgb = renderer.render(&[instance], &[(truth, intrinsics())], 0).unwrap().rgb;
+    let [whole, baked] = baked(true).map(|(model, instance)| -> Estimate {
+        let (rgb, starts) = (rgb.clone(), camera::neighbor4(&truth));
+        let query = Query { instance, rgb, width: SIZE[0], height: SIZE[1], intrinsics: intrinsics(), starts };
+        let options = Options::default().with_steps(6);
+        estimate(&engine, &model, &[query], &options, |_| Ok(())).unwrap().remove(0)
+    });
+    let (rotation, translation) = camera::pose_error(&whole.pose.to_matrix(), &baked.pose.to_matrix());
+    println!("{rotation:.1e}° {translation:.1e} apart");
+    assert!(rotation < 1e-2 && translation < 1e-4 && whole.ranking[0].start == baked.ranking[0].start);
+}
+
+#[test]
+fn every_kernel_of_its_plan_is_right() {
+    let [_, (model, _)] = baked(true);
+    let shape = Shape { hypotheses: 3, width: SIZE[0], height: SIZE[1], instances: 2 };
+    let batch = batch(3);
+    let [mut subject, mut reference] = engines().map(|engine| {
+        let mut descent = Descent::new(&engine, &model, shape, Method::LevenbergMarquardt { soft: 0.3 }).unwrap();
+        descent.set_targets(&[0, 0], &[0, 1, 1], &batch.rays, &batch.target_rgb).unwrap();
+        descent.set_poses(&poses(3)).unwrap();
+        descent.evaluate().unwrap();
+        descent
+    });
+    let (subject, reference) = (subject.executor(), reference.executor());
+    share_inputs(subject, reference);
+    let instances = step_by_step(subject, reference, "instances");
+    assert_eq!(instances.into_keys().collect::<Vec<_>>(), ["embedding/forward"], "nothing but copies");
+    step_by_step(subject, reference, "evaluate");
+}
+
+/// The paper's networks; how long the codes were does not matter any more.
+#[test]
+fn its_file_is_small_and_reads_back() {
+    let config = ModelConfig { hidden: 256, latent: 2, instances: 2, tracing_steps: 10, density: true };
+    let baked = Model::init(&config, 1).unwrap().bake(1).unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("baked.safetensors");
+    baked.save(&path).unwrap();
+    let bytes = std::fs::metadata(&path).unwrap().len();
+    println!("{bytes} bytes");
+    assert!(bytes < 4_000_000, "{bytes} bytes");
+    assert_eq!(Model::load(&path).unwrap(), baked);
+    assert_eq!((baked.layout.instances, baked.instance("1").unwrap()), (1, 0));
+}
+
+#[test]
+fn it_has_nothing_to_train() {
+    let [(whole, _), (baked, _)] = baked(true);
+    let refused = |error: Error| assert!(error.to_string().contains("baked"), "{error}");
+    for train in [Train::Everything, Train::Codes] {
+        refused(Trainer::new(&Engine::cpu(), baked.clone(), train, 1, RAYS).err().unwrap());
+    }
+    refused(baked.with_new_instances(vec!["new".into()]).unwrap_err());
+    refused(baked.bake(0).unwrap_err());
+    assert!(whole.bake(INSTANCES).unwrap_err().to_string().contains("the model has 4"));
+}
