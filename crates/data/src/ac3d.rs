@@ -59,7 +59,7 @@ impl<'a> Reader<'a> {
 
     /// The next line that is not empty.
     fn line(&mut self) -> Result<&'a str> {
-        while let Some((number, line)) = self.lines.next() {
+        for (number, line) in self.lines.by_ref() {
             self.at = number + 1;
             if !line.trim().is_empty() {
                 return Ok(line.trim());

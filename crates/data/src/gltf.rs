@@ -234,9 +234,15 @@ pub(crate) mod tests {
             let error = load(&path).unwrap_err().to_string();
             assert!(error.contains("mesh.glb") && error.contains(word) && !error.contains('\n'), "{error}");
         }
-        // Nodes that contain themselves.
-        let looped = String::from_utf8_lossy(&triangle("")).replacen(r#""children": [1]"#, r#""children": [0]"#, 1);
-        std::fs::write(&path, looped.as_bytes()).unwrap();
-        assert!(load(&path).is_err());
+        // A node that holds itself, and one in two places: sixty such would be 2^60.
+        let holds = br#"3], "children": [1]"#;
+        for other in [br#"3], "children": [0]"#, br#"3],"children":[1,1]"#] {
+            let mut bytes = triangle("");
+            let at = bytes.windows(holds.len()).position(|window| window == holds).unwrap();
+            bytes[at..at + holds.len()].copy_from_slice(other);
+            std::fs::write(&path, &bytes).unwrap();
+            let error = load(&path).unwrap_err().to_string();
+            assert!(error.contains("nodes: expected each of 2 in one place"), "{error}");
+        }
     }
 }

@@ -219,6 +219,23 @@ mod tests {
     }
 
     #[test]
+    fn files_that_multiply_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::create_dir_all(dir.path().join("parts")).unwrap();
+        write(dir.path().join("LDConfig.ldr"), CONFIG).unwrap();
+        let path = |i: usize| dir.path().join(format!("parts/a{i}.dat"));
+        for i in 0..40 {
+            let line = format!("1 16 0 0 0 1 0 0 0 1 0 0 0 1 a{}.dat\n", i + 1);
+            write(path(i), line.repeat(2)).unwrap();
+        }
+        write(path(40), "3 16 0 0 0 1 0 0 0 1 0\n").unwrap();
+        let load = |i: usize| Library::of_part(&path(i)).unwrap().load(&path(i), Some(4));
+        assert_eq!(load(36).unwrap().vertices.len(), 3 << 4);
+        let error = load(0).unwrap_err().to_string();
+        assert!(error.contains("sub-files: expected at most"), "{error}");
+    }
+
+    #[test]
     fn the_name_decides_the_colour_for_ever() {
         // Published values of FNV-1a, 64 bits.
         assert_eq!(name_hash(""), 0xcbf29ce484222325);

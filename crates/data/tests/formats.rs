@@ -12,7 +12,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 mod spoil;
-use spoil::{fuzz, one_spoiled, spoiled};
+use spoil::{fuzz, spoiled};
 
 const BOX: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/box");
 /// Length of the box's diagonal in metres.
@@ -574,7 +574,7 @@ fn survive_all(target: &str, format: Format) {
     let dir = tempfile::tempdir().unwrap();
     let (_, path, files) = sources(dir.path()).into_iter().find(|(found, ..)| *found == format).unwrap();
     let good: Vec<_> = files.iter().map(|file| fs::read(file).unwrap()).collect();
-    fuzz(target, 200, &one_spoiled(files.len()), |(which, spoiled)| {
+    fuzz(target, 200, &(0..files.len(), spoiled()), |(which, spoiled)| {
         for (k, (file, good)) in files.iter().zip(&good).enumerate() {
             let bytes = if k == which { spoiled.of(good) } else { good.clone() };
             fs::write(file, bytes).unwrap();
@@ -619,7 +619,7 @@ fn fuzz_srn_set() {
     let instance = written(&capture, Format::Srn, &set);
     let files = ["pose/000001.txt", "intrinsics.txt", "rgb/000001.png"].map(|file| instance.join(file));
     let good = files.each_ref().map(|file| fs::read(file).unwrap());
-    fuzz("srn-set", 400, &one_spoiled(files.len()), |(which, spoiled)| {
+    fuzz("srn-set", 400, &(0..files.len(), spoiled()), |(which, spoiled)| {
         for (k, (file, good)) in files.iter().zip(&good).enumerate() {
             let bytes = if k == which { spoiled.of(good) } else { good.clone() };
             fs::write(file, bytes).unwrap();

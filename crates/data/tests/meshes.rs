@@ -5,7 +5,7 @@ use srn_data::mesh;
 use std::fs;
 
 mod spoil;
-use spoil::{fuzz, one_spoiled};
+use spoil::{fuzz, spoiled};
 
 const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\n\
     property uchar green\nproperty uchar blue\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n\
@@ -120,7 +120,7 @@ fn survive(target: &str, files: &[(&str, Vec<u8>)]) {
     let mesh_file = path(files[0].0);
     let good = mesh::load(&mesh_file).unwrap().0;
     assert!(good.warnings.is_empty() && good.textures.len() < files.len(), "{target}: {:?}", good.warnings);
-    fuzz(target, 400, &one_spoiled(files.len()), |(which, spoiled)| {
+    fuzz(target, 400, &(0..files.len(), spoiled()), |(which, spoiled)| {
         for (k, (name, good)) in files.iter().enumerate() {
             let bytes = if k == which { spoiled.of(good) } else { good.clone() };
             fs::write(path(name), bytes).unwrap();

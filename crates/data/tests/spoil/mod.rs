@@ -141,11 +141,6 @@ impl Change {
     }
 }
 
-/// One of several files, and what becomes of it.
-pub fn one_spoiled(files: usize) -> impl Strategy<Value = (usize, Spoiled)> {
-    (0..files, spoiled())
-}
-
 /// What a file is replaced by.
 #[derive(Debug, Clone)]
 pub enum Spoiled {
