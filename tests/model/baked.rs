@@ -42,7 +42,7 @@ fn it_finds_the_same_pose() {
     let rgb = renderer.render(&[instance], &[(truth, intrinsics())], 0).unwrap().rgb;
     let [whole, baked] = baked(true).map(|(model, instance)| -> Estimate {
         let (rgb, starts) = (rgb.clone(), camera::neighbor4(&truth));
-        let query = Query { instance, rgb, width: SIZE[0], height: SIZE[1], intrinsics: intrinsics(), starts };
+        let query = Query { instance, rgb, weights: None, width: SIZE[0], height: SIZE[1], intrinsics: intrinsics(), starts };
         let options = Options::default().with_steps(6);
         estimate(&engine, &model, &[query], &options, |_| Ok(())).unwrap().remove(0)
     });
@@ -58,8 +58,8 @@ fn every_kernel_of_its_plan_is_right() {
     let shape = Shape { hypotheses: 3, width: SIZE[0], height: SIZE[1], instances: 2 };
     let batch = batch(3);
     let [mut subject, mut reference] = engines().map(|engine| {
-        let mut descent = Descent::new(&engine, &model, shape, Method::LevenbergMarquardt { soft: 0.3 }).unwrap();
-        descent.set_targets(&[0, 0], &[0, 1, 1], &batch.rays, &batch.target_rgb).unwrap();
+        let mut descent = Descent::new(&engine, &model, shape, Method::Bfgs { soft: 0.3 }).unwrap();
+        descent.set_targets(&[0, 0], &[0, 1, 1], &batch.rays, &batch.target_rgb, None).unwrap();
         descent.set_poses(&poses(3)).unwrap();
         descent.evaluate().unwrap();
         descent

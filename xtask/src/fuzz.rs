@@ -23,6 +23,8 @@ pub fn run(arguments: &[String]) -> Result<(), String> {
         "meshes",
         "--test",
         "files",
+        "--test",
+        "torch",
     ]);
     command.args([&test, "--", "--nocapture"]).env("SRN_FUZZ_SECONDS", seconds);
     let mut child = command.stdout(Stdio::piped()).spawn().map_err(|error| error.to_string())?;

@@ -13,7 +13,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 #[path = "../../data/tests/spoil/mod.rs"]
 mod spoil;
-use spoil::{config, spoiled};
+use spoil::{fuzz, spoiled};
 
 /// `{'model': …}` by PyTorch, in the format before 1.6.
 const LEGACY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/tiny.pth");
@@ -229,21 +229,23 @@ fn bad_files_are_refused_by_name() {
 
 /// Whatever is done to a file or to the pickle in it: an error in one line, or a model that is in order.
 #[test]
-fn no_file_makes_the_reader_panic_or_pass_on_what_is_not_finite() {
+fn fuzz_torch() {
     let (dir, good) = home();
     let path = dir.path().join("spoiled.pth");
     let mut pickle = Vec::new();
     ZipArchive::new(Cursor::new(&good)).unwrap().by_name("archive/data.pkl").unwrap().read_to_end(&mut pickle).unwrap();
     let legacy = fs::read(LEGACY).unwrap();
-    proptest!(config(300), |(spoiled in spoiled(), kind in 0..3)| {
-        fs::write(&path, match kind {
+    fuzz("torch", 300, &(spoiled(), 0..3), |(spoiled, kind)| {
+        let bytes = match kind {
             0 => spoiled.of(&good),
             1 => with_pickle(&good, &spoiled.of(&pickle)),
             _ => spoiled.of(&legacy),
-        }).unwrap();
+        };
+        fs::write(&path, bytes).unwrap();
         match load(&path) {
             Ok(model) => prop_assert!(model.parameters.iter().flat_map(|p| &p.values).all(|value| value.is_finite())),
             Err(error) => prop_assert!(!error.to_string().contains('\n'), "{}", error),
         }
+        Ok(())
     });
 }
