@@ -68,7 +68,9 @@ fn every_kernel_of_its_plan_is_right() {
     share_inputs(subject, reference);
     let instances = step_by_step(subject, reference, "instances");
     assert_eq!(instances.into_keys().collect::<Vec<_>>(), ["embedding/forward"], "nothing but copies");
-    step_by_step(subject, reference, "evaluate");
+    for stage in ["begin", "evaluate"] {
+        step_by_step(subject, reference, stage);
+    }
 }
 
 /// The paper's networks; how long the codes were does not matter any more.

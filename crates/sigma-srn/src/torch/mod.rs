@@ -230,6 +230,13 @@ fn open(mut file: BufReader<File>) -> Result<(Archive, Pickle), String> {
     let folder = |name: &str| Some(name.strip_suffix("data.pkl").filter(|folder| folder.ends_with('/'))?.to_owned());
     let folder = zip.file_names().flatten().find_map(|name| folder(&name));
     let folder = folder.ok_or("a zip archive without data.pkl: not of torch.save")?;
+    // A small file could hold much.
+    for number in 0..zip.len() {
+        let entry = zip.by_index_raw(number).map_err(broken)?;
+        if entry.compression() != CompressionMethod::Stored {
+            return Err("a compressed zip archive: not of torch.save".into());
+        }
+    }
     let mut order = String::new();
     match zip.by_name(&format!("{folder}byteorder")) {
         Ok(entry) => _ = entry.take(10).read_to_string(&mut order).map_err(io)?,
