@@ -268,10 +268,10 @@ impl Collector<'_> {
         }
     }
 
-    /// Codes and hypernetwork; also the number of codes, and the layers that it makes.
-    fn hypernetwork(&mut self) -> Result<(Hypernetwork, u32, Vec<(u32, u32)>), Error> {
+    /// Codes and hypernetwork, and the layers that it makes.
+    fn hypernetwork(&mut self) -> Result<(Hypernetwork, Vec<(u32, u32)>), Error> {
         let shape = self.shape(CODES, 2)?;
-        let (instances, latent) = (shape[0] as u32, shape[1] as u32);
+        let latent = shape[1] as u32;
         let codes = self.push(Kind::Codes, vec![(CODES.into(), shape)]);
         let mut layers = Vec::new();
         let mut scene = Vec::new();
@@ -280,7 +280,7 @@ impl Collector<'_> {
             let prefix = format!("{HYPER}.{}.hyper_linear.hypo_params.net", layers.len());
             let first = ["net.0.weight", "weight"].map(|name| self.shapes.shape(&format!("{prefix}.0.{name}")));
             if first == [None, None] && !layers.is_empty() {
-                return Ok((Hypernetwork { codes, latent, layers }, instances, scene));
+                return Ok((Hypernetwork { codes, latent, layers }, scene));
             }
             let blocks = self.mlp(Kind::HyperOutput, &prefix, latent)?;
             let emitted = blocks.last().expect("an MLP has a last layer").out_features;
@@ -312,7 +312,8 @@ fn collect(shapes: &dyn Shapes, tracing_steps: u32) -> Result<(Layout, Vec<Param
     let mut collector = Collector { shapes, parameters: Vec::new() };
     let baked = collector.baked()?;
     let (source, instances, scene) = if baked.is_empty() {
-        let (hypernetwork, instances, scene) = collector.hypernetwork()?;
+        let (hypernetwork, scene) = collector.hypernetwork()?;
+        let instances = collector.parameters[hypernetwork.codes].tensors[0].1[0] as u32;
         (Source::Hypernetwork(hypernetwork), instances, scene)
     } else {
         let scene = baked.iter().map(|layer| (layer.in_features, layer.out_features)).collect();
