@@ -208,7 +208,7 @@ impl Render {
         println!("{out}/train: {train} instances of {views} views, {focal:.3} px focal length");
         println!("{out}/test: {train} instances of {test_views} views");
         println!("{out}/heldout: {held_out} instances of {test_views} views");
-        println!("{}: a view of each; {skipped} objects skipped", sheet_file.display());
+        println!("{}: a view of each object; {skipped} skipped", sheet_file.display());
         Ok(())
     }
 
