@@ -291,59 +291,41 @@ impl Summary {
 }
 
 impl Report {
-    /// A table in Markdown, aligned.
+    /// A table in Markdown, aligned; with errors in the source's unit where it is known.
     fn table(&self) -> String {
-        let head = [
-            "instance",
-            "views",
-            "rot mean",
-            "median",
-            "<= 5°",
-            "<= 10°",
-            "oracle mean",
-            "median",
-            "tra mean",
-            "median",
-            "% of distance",
-            "median",
-            "in source",
-            "median",
-            "converged",
-            "s/view",
+        let degrees = |x: f64| format!("{x:.2}°");
+        type Cell = Box<dyn Fn(&Summary) -> String>;
+        let mut columns: Vec<(&str, Cell)> = vec![
+            ("instance", Box::new(|s| s.name.clone())),
+            ("views", Box::new(|s| s.views.to_string())),
+            ("rot mean", Box::new(move |s| degrees(s.rotation_deg.mean))),
+            ("median", Box::new(move |s| degrees(s.rotation_deg.median))),
+            ("<= 5°", Box::new(|s| format!("{:.2}", s.recall_5_deg))),
+            ("<= 10°", Box::new(|s| format!("{:.2}", s.recall_10_deg))),
+            ("oracle mean", Box::new(move |s| degrees(s.oracle_deg.mean))),
+            ("median", Box::new(move |s| degrees(s.oracle_deg.median))),
+            ("tra mean", Box::new(|s| format!("{:.3}", s.translation.mean))),
+            ("median", Box::new(|s| format!("{:.3}", s.translation.median))),
+            ("% of distance", Box::new(|s| format!("{:.2}", s.translation_percent.median))),
+            ("converged", Box::new(|s| s.converged.to_string())),
+            ("s/view", Box::new(|s| format!("{:.2}", s.seconds_per_view))),
         ];
-        let row = |s: &Summary| {
-            let degrees = |s: Statistics| [s.mean, s.median].map(|x| format!("{x:.2}°"));
-            let [rotation, rotation_median] = degrees(s.rotation_deg);
-            let [oracle, oracle_median] = degrees(s.oracle_deg);
-            let [translation, translation_median] = [s.translation.mean, s.translation.median].map(|x| format!("{x:.3}"));
-            let [percent, percent_median] = [s.translation_percent.mean, s.translation_percent.median].map(|x| format!("{x:.2}"));
-            let in_source = |pick: fn(Statistics) -> f64| s.translation_source.map_or("-".into(), |s| significant(pick(s)));
-            let [recall_5, recall_10] = [s.recall_5_deg, s.recall_10_deg].map(|x| format!("{x:.2}"));
-            [
-                s.name.clone(),
-                s.views.to_string(),
-                rotation,
-                rotation_median,
-                recall_5,
-                recall_10,
-                oracle,
-                oracle_median,
-                translation,
-                translation_median,
-                percent,
-                percent_median,
-                in_source(|s| s.mean),
-                in_source(|s| s.median),
-                s.converged.to_string(),
-                format!("{:.2}", s.seconds_per_view),
-            ]
-        };
-        let mut rows = vec![head.map(String::from)];
+        if self.overall.translation_source.is_some() {
+            let in_source = |pick: fn(Statistics) -> f64| -> Cell {
+                Box::new(move |s| s.translation_source.map_or("-".into(), |s| significant(pick(s))))
+            };
+            columns.splice(
+                11..11,
+                [("in source: mean", in_source(|s: Statistics| s.mean)), ("median", in_source(|s: Statistics| s.median))],
+            );
+        }
+        let row = |s: &Summary| columns.iter().map(|(_, cell)| cell(s)).collect::<Vec<_>>();
+        let mut rows = vec![columns.iter().map(|(head, _)| head.to_string()).collect()];
         rows.extend(self.instances.iter().chain([&self.overall]).map(row));
         let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-        let widths: [usize; 16] = std::array::from_fn(width);
-        let line = |row: &[String; 16]| {
-            let cells: Vec<_> = row.iter().zip(widths).map(|(cell, width)| format!(" {cell:>width$} ")).collect();
+        let widths: Vec<usize> = (0..columns.len()).map(width).collect();
+        let line = |row: &Vec<String>| {
+            let cells: Vec<_> = row.iter().zip(&widths).map(|(cell, width)| format!(" {cell:>width$} ")).collect();
             format!("|{}|", cells.join("|"))
         };
         let mut lines: Vec<_> = rows.iter().map(line).collect();
