@@ -285,11 +285,7 @@ impl Descent {
 
     /// Where each hypothesis stands, with its loss there: Adam at its last step, BFGS at its best.
     pub fn standing(&mut self) -> Result<Vec<(f64, Pose6)>, Error> {
-        let Moves::Bfgs { state, .. } = self.handles.moves else { return Ok(zip(self.losses()?, self.poses()?).collect()) };
-        if !self.begun {
-            return Ok(zip(self.losses()?, self.poses()?).collect());
-        }
-        let states = self.runner.read(state)?;
+        let Some(states) = self.states()? else { return Ok(zip(self.losses()?, self.poses()?).collect()) };
         let standing = states.chunks_exact(bfgs::STATE as usize).map(|state| {
             let rows = &state[bfgs::STATE_POSE..bfgs::STATE_POSE + 12];
             (state[bfgs::STATE_LOSS].into(), Pose6::from_matrix(&from_rows(rows)))
@@ -300,12 +296,16 @@ impl Descent {
     /// Second derivatives of each hypothesis's loss at its best pose, over a turn about the object and a shift, in the camera's axes, as
     /// BFGS knows them so far; nothing for Adam, nor before the first evaluation.
     pub fn curvatures(&mut self) -> Result<Vec<[[f64; 6]; 6]>, Error> {
-        let Moves::Bfgs { state, .. } = self.handles.moves else { return Ok(vec![]) };
-        if !self.begun {
-            return Ok(vec![]);
-        }
-        let states = self.runner.read(state)?;
+        let states = self.states()?.unwrap_or_default();
         Ok(states.chunks_exact(bfgs::STATE as usize).map(bfgs::curvature).collect())
+    }
+
+    /// States of BFGS, once it has begun.
+    fn states(&mut self) -> Result<Option<Vec<f32>>, Error> {
+        match self.handles.moves {
+            Moves::Bfgs { state, .. } if self.begun => Ok(Some(self.runner.read(state)?)),
+            _ => Ok(None),
+        }
     }
 
     /// Colours of the last evaluation `[hypotheses, rays, 3]`.
