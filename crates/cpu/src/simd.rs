@@ -68,5 +68,15 @@ pub(crate) fn sum<T: Real>(a: &[T], b: &[T], term: impl Fn(T, T) -> T) -> T {
     for (lane, (&a, &b)) in a_rest.iter().zip(b_rest).enumerate() {
         lanes[lane] += term(a, b);
     }
-    lanes.iter().copied().sum()
+    total(lanes)
+}
+
+/// The sum of the lanes, in a tree: a chain of sixteen additions would be most of the time of a short row.
+#[inline(always)]
+pub(crate) fn total<T: Real>(mut lanes: [T; LANES]) -> T {
+    for half in [8, 4, 2, 1] {
+        let (low, high) = lanes.split_at_mut(half);
+        low.iter_mut().zip(high).for_each(|(low, &mut high)| *low += high);
+    }
+    lanes[0]
 }
