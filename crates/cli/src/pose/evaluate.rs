@@ -7,13 +7,15 @@ use glam::DMat4;
 use serde::Serialize;
 use srn_data::camera::Axes;
 use srn_data::sheet;
-use srn_data::srn::{InstanceFiles, SrnSet};
 
 use super::draw;
-use super::files::{Picture, create_dir, model_side, write_png};
+use super::files::{Picture, create_dir, write_png};
 use super::notation::{Notation, NotationArgs};
 use super::search::{Found, PoseError, SearchArgs, Starts};
-use crate::common::{EngineArgs, Result, camera, load_model, print, progress, refuse_existing};
+use super::summary::{Statistics, Summary, markdown};
+use super::tables;
+use super::views::{self, Views};
+use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
 
 /// Side of a view on the sheet, pixels.
 const SHOWN: u32 = 128;
@@ -25,36 +27,47 @@ const COLUMNS: usize = 4;
 pub struct Evaluate {
     /// Model, or checkpoint of a training run.
     #[arg(long, value_name = "FILE")]
-    model: PathBuf,
+    pub(super) model: PathBuf,
     /// Data set in the SRN folder layout, of views that the model has not seen; instances are matched by name.
     #[arg(long, value_name = "DIR")]
-    data: PathBuf,
+    pub(super) data: PathBuf,
     /// Where to start: `neighbor4`, the true pose turned by 30° to four sides; `around84`, all around; `fixed24`, the paper's fewer;
     /// or a file with 16 numbers per line, a `world_from_camera` each.
     #[arg(long, value_name = "neighbor4|around84|fixed24|FILE", default_value = "neighbor4")]
-    starts: Starts,
+    pub(super) starts: Starts,
     /// Views of each instance, evenly spread over those that there are.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
-    views: u32,
-    /// Instances, the first by name.
+    pub(super) views: u32,
+    /// Instances, evenly spread over those that there are.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
-    instances: u32,
+    pub(super) instances: u32,
+    /// Instead, measure both presets from `neighbor4` and `fixed24`, the default one from `around84` too, and write to this folder the
+    /// paper's tables for this model and data, with 95 % intervals: tables.md, views.csv, convergence.csv and .png, and pictures of the
+    /// worst searches.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["starts", "json", "out"])]
+    pub(super) tables: Option<PathBuf>,
+    /// For --tables: instances that the model was not trained on; their codes are fitted to two views each (the paper's Table 2).
+    #[arg(long, value_name = "DIR", requires = "tables")]
+    pub(super) heldout: Option<PathBuf>,
+    /// For --tables: how many of all views the paper's preset searches for, which takes minutes a view on a CPU. Default: all.
+    #[arg(long, value_name = "N", requires = "tables", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) paper_views: Option<u32>,
     /// Print everything as JSON.
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
     /// Write results.json and pictures.png, worst first, to this folder.
     #[arg(long, value_name = "DIR")]
-    out: Option<PathBuf>,
+    pub(super) out: Option<PathBuf>,
     /// Overwrite the files in the folder of --out.
     #[arg(long)]
-    force: bool,
+    pub(super) force: bool,
     #[command(flatten)]
-    engine: EngineArgs,
+    pub(super) engine: EngineArgs,
     #[command(flatten)]
-    poses: NotationArgs,
+    pub(super) poses: NotationArgs,
     // Last, for its heading holds for all flags that follow.
     #[command(flatten)]
-    search: SearchArgs,
+    pub(super) search: SearchArgs,
 }
 
 /// What `--json` prints and `results.json` holds.
@@ -71,88 +84,41 @@ struct Report {
     views: Vec<ViewReport>,
 }
 
-/// Errors of several views.
-#[derive(Serialize)]
-struct Summary {
-    name: String,
-    views: usize,
-    converged: usize,
-    rotation_deg: Statistics,
-    translation: Statistics,
-    translation_percent: Statistics,
-    /// Translation in units of the source; where all instances were imported.
-    translation_source: Option<Statistics>,
-    /// Parts of the views with a rotation error of at most 5° and 10°.
-    recall_5_deg: f64,
-    recall_10_deg: f64,
-    /// Rotation error of the start that came nearest to the truth, the winner or not: what a perfect choice would reach.
-    oracle_deg: Statistics,
-    seconds_per_view: f64,
-}
-
-#[derive(Clone, Copy, Serialize)]
-struct Statistics {
-    mean: f64,
-    median: f64,
-}
-
-#[derive(Serialize)]
-struct ViewReport {
-    instance: String,
-    view: String,
-    error: PoseError,
+/// One search.
+#[derive(Clone, Serialize)]
+pub(super) struct ViewReport {
+    pub instance: String,
+    pub view: String,
+    pub error: PoseError,
     /// The error of the translation in units of the source, if the instance was imported.
-    translation_source: Option<f64>,
+    pub translation_source: Option<f64>,
     /// Errors of the start that came nearest in rotation.
-    oracle: PoseError,
-    start: usize,
-    loss: f64,
-    unexplained: f64,
-    converged: bool,
-    seconds: f64,
+    pub oracle: PoseError,
+    pub start: usize,
+    pub loss: f64,
+    pub unexplained: f64,
+    pub converged: bool,
+    pub seconds: f64,
     /// Rows of the estimate.
-    world_from_camera: [[f64; 4]; 4],
+    pub world_from_camera: [[f64; 4]; 4],
     /// The same in frame and units of the source, if the instance was imported.
-    source_from_camera: Option<[[f64; 4]; 4]>,
+    pub source_from_camera: Option<[[f64; 4]; 4]>,
 }
 
 /// Runs the command.
 pub fn run(args: &Evaluate) -> Result<bool> {
+    if let Some(dir) = &args.tables {
+        return tables::write(args, dir);
+    }
     let model = load_model(&args.model)?;
-    let mut instances = SrnSet::open(&args.data)?.instances;
-    let found = instances.len();
-    instances.retain(|files| model.instance(&files.name).is_ok());
-    if instances.is_empty() {
-        let known = model.metadata.instance_names.join(", ");
-        return Err(format!("{}: none of its {found} instances is in the model, which knows {known}", args.data.display()).into());
-    }
-    if instances.len() < found {
-        eprintln!("{} of {found} instances are not in the model and are left out", found - instances.len());
-    }
-    instances.truncate(args.instances as usize);
-    for files in &mut instances {
-        files.views = spread(std::mem::take(&mut files.views), args.views as usize);
-    }
-    let first = instances.iter().flat_map(|files| &files.views).find_map(|view| view.rgb.as_deref());
-    let side = model_side(&model, first.unwrap_or(&args.data))?;
-    let pictures = |files: &InstanceFiles| -> Result<Vec<(Picture, DMat4)>> {
-        let instance = model.instance(&files.name)?;
-        let picture = |view: srn_data::LoadedView| {
-            let (truth, intrinsics) = camera(&view);
-            let square = ([0; 2], side as usize);
-            let (name, rgb) = (view.name, view.rgb);
-            (Picture { name, instance, rgb, weights: None, intrinsics, truth: Some(truth), distance: None, square }, truth)
-        };
-        Ok(files.load(side as usize)?.views.into_iter().map(picture).collect())
-    };
+    let (side, asked) = views::open(&model, &args.data, args.instances, args.views)?;
     let notation = args.poses.open()?;
-    // All are read, and the starts known, before the first is searched for.
+    // The starts are known before the first is searched for.
     let mut queries = Vec::new();
-    for files in &instances {
-        let (pictures, truths): (Vec<_>, Vec<_>) = pictures(files)?.into_iter().unzip();
+    for Views { name, dir, pictures, truths } in &asked {
         let starts = |(picture, truth)| args.search.starts(&args.starts, &model, picture, side, Some(truth), &notation);
-        let starts = pictures.iter().zip(&truths).map(starts).collect::<Result<Vec<_>>>()?;
-        queries.push((&files.name, args.poses.source(Some(&files.dir))?, pictures, truths, starts));
+        let starts = pictures.iter().zip(truths).map(starts).collect::<Result<Vec<_>>>()?;
+        queries.push((name, args.poses.source(Some(dir))?, pictures, truths, starts));
     }
     let files = ["results.json", "pictures.png"];
     if let Some(dir) = &args.out {
@@ -163,7 +129,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     let engine = args.engine.open()?;
 
     let steps: u64 = options.phases.iter().map(|phase| u64::from(phase.steps)).sum();
-    let bar = progress(steps * instances.len() as u64, "steps");
+    let bar = progress(steps * asked.len() as u64, "steps");
     let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();
     for (i, (name, source, pictures, truths, starts)) in queries.iter().enumerate() {
         bar.set_message(name.to_string());
@@ -171,7 +137,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
             bar.set_position(i as u64 * steps + u64::from(progress.step));
             Ok(())
         })?;
-        let reports = pictures.iter().zip(truths).zip(found);
+        let reports = pictures.iter().zip(*truths).zip(found);
         for ((picture, truth), found) in reports {
             let report = view_report(name, picture, truth, &found, notation.axes, source.as_ref());
             results.push((report, picture, found));
@@ -179,7 +145,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     }
     bar.finish_and_clear();
 
-    let sheet = args.out.as_ref().map(|_| pictures_sheet(&results, side));
+    let sheet = args.out.as_ref().map(|_| pictures_sheet(&results, side, usize::MAX));
     let views: Vec<ViewReport> = results.into_iter().map(|(report, ..)| report).collect();
     let of = |name: &str| Summary::of(name, &views.iter().filter(|view| view.instance == name).collect::<Vec<_>>());
     let report = Report {
@@ -187,7 +153,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
         executor: engine.to_string(),
         convention: notation.axes,
         overall: Summary::of("all", &views.iter().collect::<Vec<_>>()),
-        instances: instances.iter().map(|files| of(&files.name)).collect(),
+        instances: asked.iter().map(|views| of(&views.name)).collect(),
         views,
     };
     let json = serde_json::to_string_pretty(&report)?;
@@ -200,14 +166,8 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     Ok(true)
 }
 
-/// `n` of the items, evenly spaced; the first among them.
-fn spread<T>(items: Vec<T>, n: usize) -> Vec<T> {
-    let (len, n) = (items.len(), n.min(items.len()));
-    let chosen: Vec<usize> = (0..n).map(|k| k * len / n).collect();
-    items.into_iter().enumerate().filter(|(i, _)| chosen.contains(i)).map(|(_, item)| item).collect()
-}
-
-fn view_report(
+/// What there is to say about a search.
+pub(super) fn view_report(
     instance: &str,
     picture: &Picture,
     truth: &DMat4,
@@ -233,12 +193,12 @@ fn view_report(
     }
 }
 
-/// Target, estimate and difference of every view, the largest rotation error first.
-fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u32) -> image::RgbImage {
+/// Target, estimate and difference of the views, at most so many, the largest rotation error first.
+pub(super) fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u32, most: usize) -> image::RgbImage {
     let mut order: Vec<_> = results.iter().collect();
     order.sort_by(|a, b| b.0.error.rotation_deg.total_cmp(&a.0.error.rotation_deg));
     let mut cells = Vec::new();
-    for (report, picture, found) in order {
+    for (report, picture, found) in order.into_iter().take(most) {
         let views = [
             draw::view(&picture.rgb, side, SHOWN),
             draw::view(&found.rgb, side, SHOWN),
@@ -256,38 +216,6 @@ fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u32) -> image
     sheet::text(&mut page, 4, 8, "target | view from the estimated pose | difference; the worst first", sheet::BLACK);
     image::imageops::replace(&mut page, &grid, 0, 24);
     page
-}
-
-impl Statistics {
-    fn of(values: impl Iterator<Item = f64>) -> Self {
-        let mut values: Vec<f64> = values.collect();
-        values.sort_by(f64::total_cmp);
-        let n = values.len();
-        let median = 0.5 * (values[(n - 1) / 2] + values[n / 2]);
-        Statistics { mean: values.iter().sum::<f64>() / n as f64, median }
-    }
-}
-
-impl Summary {
-    /// Of at least one view.
-    fn of(name: &str, views: &[&ViewReport]) -> Self {
-        let n = views.len() as f64;
-        let in_source: Option<Vec<f64>> = views.iter().map(|view| view.translation_source).collect();
-        let part = |limit: f64| views.iter().filter(|view| view.error.rotation_deg <= limit).count() as f64 / n;
-        Summary {
-            name: name.into(),
-            views: views.len(),
-            converged: views.iter().filter(|view| view.converged).count(),
-            rotation_deg: Statistics::of(views.iter().map(|view| view.error.rotation_deg)),
-            translation: Statistics::of(views.iter().map(|view| view.error.translation)),
-            translation_percent: Statistics::of(views.iter().map(|view| view.error.translation_percent)),
-            translation_source: in_source.map(|errors| Statistics::of(errors.into_iter())),
-            recall_5_deg: part(5.0),
-            recall_10_deg: part(10.0),
-            oracle_deg: Statistics::of(views.iter().map(|view| view.oracle.rotation_deg)),
-            seconds_per_view: views.iter().map(|view| view.seconds).sum::<f64>() / n,
-        }
-    }
 }
 
 impl Report {
@@ -322,16 +250,7 @@ impl Report {
         let row = |s: &Summary| columns.iter().map(|(_, cell)| cell(s)).collect::<Vec<_>>();
         let mut rows = vec![columns.iter().map(|(head, _)| head.to_string()).collect()];
         rows.extend(self.instances.iter().chain([&self.overall]).map(row));
-        let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-        let widths: Vec<usize> = (0..columns.len()).map(width).collect();
-        let line = |row: &Vec<String>| {
-            let cells: Vec<_> = row.iter().zip(&widths).map(|(cell, width)| format!(" {cell:>width$} ")).collect();
-            format!("|{}|", cells.join("|"))
-        };
-        let mut lines: Vec<_> = rows.iter().map(line).collect();
-        let rule: Vec<_> = widths.iter().map(|width| "-".repeat(width + 1) + ":").collect();
-        lines.insert(1, format!("|{}|", rule.join("|")));
-        lines.join("\n")
+        markdown(&rows)
     }
 }
 
@@ -346,22 +265,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn views_are_spread_evenly() {
-        assert_eq!(spread((0..20).collect(), 4), [0, 5, 10, 15]);
-        assert_eq!(spread((0..3).collect(), 10), [0, 1, 2]);
-        assert_eq!(spread((0..7).collect(), 3), [0, 2, 4]);
-        assert!(spread(Vec::<u8>::new(), 3).is_empty());
-    }
-
-    #[test]
     fn three_digits_count() {
         assert_eq!([0.009_123, 9.123, 912.3, 0.0].map(significant), ["0.00912", "9.12", "912", "0"]);
-    }
-
-    #[test]
-    fn statistics_of_odd_and_even_counts() {
-        let of = |values: &[f64]| Statistics::of(values.iter().copied());
-        assert_eq!((of(&[3.0, 1.0, 8.0]).mean, of(&[3.0, 1.0, 8.0]).median), (4.0, 3.0));
-        assert_eq!(of(&[4.0, 1.0, 2.0, 9.0]).median, 3.0);
     }
 }

@@ -10,6 +10,9 @@ mod outline;
 mod record;
 pub mod render;
 mod search;
+mod summary;
+mod tables;
+mod views;
 
 /// A finite number above zero.
 fn positive(text: &str) -> Result<f64, String> {

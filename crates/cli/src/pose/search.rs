@@ -61,13 +61,16 @@ pub struct SearchArgs {
     radius: Option<f64>,
 }
 
+/// Settings of a search.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum Preset {
+#[allow(missing_docs)] // told at --preset
+pub enum Preset {
     Default,
     Paper,
 }
 
-const LOSSES: [(&str, Loss); 5] =
+/// The paper's losses, and two that the authors' code adds.
+pub const LOSSES: [(&str, Loss); 5] =
     [("mae", Loss::Mae), ("mse", Loss::Mse), ("norm_l1", Loss::NormL1), ("norm_l2", Loss::NormL2), ("gmsd", Loss::Gmsd)];
 
 fn loss(name: String) -> Loss {
@@ -98,7 +101,27 @@ impl From<&str> for Starts {
     }
 }
 
+impl std::fmt::Display for Starts {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Starts::Around84 => "around84",
+            Starts::Fixed24 => "fixed24",
+            Starts::Neighbor4 => "neighbor4",
+            Starts::File(path) => return write!(f, "{}", path.display()),
+        })
+    }
+}
+
 impl SearchArgs {
+    /// The same radius, seed and limit of acceptance, with the settings of a preset; an error if other flags were given.
+    pub fn with(&self, preset: Preset, loss: Option<Loss>) -> Result<Self> {
+        let is_plain = self.preset == Preset::Default && self.loss.is_none() && self.lr.is_none() && self.steps.is_none();
+        if !is_plain || self.cull || self.no_cull || self.stride.is_some() {
+            return Err("--tables compares the presets as they are: of the flags of the search it takes --radius, --seed and --accept".into());
+        }
+        Ok(SearchArgs { preset, loss, ..self.clone() })
+    }
+
     /// The settings of the estimator.
     pub fn options(&self) -> Result<Options> {
         let mut options = match self.preset {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use sigma_srn::{Train, Trainer, stream};
+use sigma_srn::{Engine, Model, Train, Trainer, stream};
 use srn_data::{Instance, LoadedView};
 
 use super::settings::{positive, up_to};
@@ -13,6 +13,11 @@ use crate::common::{self, EngineArgs, Result};
 
 /// Unseen views of an instance that are looked at in the end, at most.
 const UNSEEN: usize = 8;
+
+/// Defaults of [`FitCodes`].
+const STEPS: u64 = 1000;
+const LEARNING_RATE: f64 = 1e-3;
+const RAYS: u32 = 1024;
 
 /// Flags of `sigma-train adapt`.
 #[derive(Args, Debug)]
@@ -32,26 +37,55 @@ pub struct AdaptArgs {
     /// Fit to the view of this name; may be repeated.
     #[arg(long, value_name = "NAME", conflicts_with = "views")]
     view: Vec<String>,
-    /// Number of steps.
-    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
-    steps: u64,
-    /// Learning rate of Adam.
-    #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive)]
-    lr: f64,
-    /// Random rays per image and step, at most a whole image.
-    #[arg(long, value_name = "N", default_value_t = 1024, value_parser = up_to(u32::MAX))]
-    rays: u32,
+    #[command(flatten)]
+    fit: FitCodes,
     /// Side of the images in pixels [the model's].
     #[arg(long, value_name = "PIXELS", value_parser = up_to(4096))]
     side: Option<u32>,
-    /// Decides the random rays.
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    seed: u64,
     #[command(flatten)]
     engine: EngineArgs,
     /// Print the result as JSON.
     #[arg(long)]
     json: bool,
+}
+
+/// How codes are fitted.
+#[derive(Args, Clone, Debug)]
+pub struct FitCodes {
+    /// Number of steps.
+    #[arg(long, value_name = "N", default_value_t = STEPS, value_parser = clap::value_parser!(u64).range(1..))]
+    steps: u64,
+    /// Learning rate of Adam.
+    #[arg(long, value_name = "RATE", default_value_t = LEARNING_RATE, value_parser = positive)]
+    lr: f64,
+    /// Random rays per image and step, at most a whole image.
+    #[arg(long, value_name = "N", default_value_t = RAYS, value_parser = up_to(u32::MAX))]
+    rays: u32,
+    /// Decides the random rays.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+}
+
+impl Default for FitCodes {
+    fn default() -> Self {
+        FitCodes { steps: STEPS, lr: LEARNING_RATE, rays: RAYS, seed: 0 }
+    }
+}
+
+/// Fits the codes to views, everything else frozen.
+pub fn fit_codes(engine: &Engine, model: Model, views: &[Shown], side: u32, how: &FitCodes) -> Result<Model> {
+    let rays = how.rays.min(side * side);
+    let mut trainer = Trainer::new(engine, model, Train::Codes, views.len() as u32, rays)?;
+    let bar = common::progress(how.steps, "fitting");
+    for step in 1..=how.steps {
+        trainer.step(&training_batch(views, side, rays, 0.0, &mut stream(how.seed, step)), how.lr)?;
+        bar.inc(1);
+        if step.is_multiple_of(20) || step == how.steps {
+            bar.set_message(format!("PSNR {:.2} dB", trainer.losses()?.psnr()));
+        }
+    }
+    bar.finish_and_clear();
+    Ok(trainer.model()?.clone())
 }
 
 /// Fits codes to a few views of each instance, and writes the model.
@@ -73,22 +107,11 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
     let fitted: Vec<Shown> = (0..).zip(&split).flat_map(|(k, (fitted, _))| fitted.iter().map(move |&view| (k, view))).collect();
 
     let engine = args.engine.open()?;
-    let rays = args.rays.min(side * side);
-    let mut trainer = Trainer::new(&engine, model, Train::Codes, fitted.len() as u32, rays)?;
-    let bar = common::progress(args.steps, "fitting");
-    for step in 1..=args.steps {
-        trainer.step(&training_batch(&fitted, side, rays, &mut stream(args.seed, step)), args.lr)?;
-        bar.inc(1);
-        if step.is_multiple_of(20) || step == args.steps {
-            bar.set_message(format!("PSNR {:.2} dB", trainer.losses()?.psnr()));
-        }
-    }
-    bar.finish_and_clear();
-    let model = trainer.model()?;
+    let model = fit_codes(&engine, model, &fitted, side, &args.fit)?;
     let mut results = vec![];
     for (instance, (fitted, unseen)) in (0..).zip(&split) {
         let views: Vec<Shown> = fitted.iter().chain(unseen).map(|&view| (instance, view)).collect();
-        let psnr = psnr_of_each(&render(&engine, model, &views, side)?, &views);
+        let psnr = psnr_of_each(&render(&engine, &model, &views, side)?, &views);
         let (fitted, unseen) = psnr.split_at(fitted.len());
         let name = model.instance_name(instance);
         results.push(Fitted { instance: name, fitted_psnr: mean(fitted), unseen_psnr: mean(unseen) });

@@ -108,7 +108,7 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         // Everything random comes from seed and step: a resumed run needs no memory of it.
         let mut random = stream(settings.seed, step);
         let views = draw_views(&set, settings.batch, &mut random);
-        trainer.step(&training_batch(&views, settings.side, settings.rays, &mut random), learning_rate)?;
+        trainer.step(&training_batch(&views, settings.side, settings.rays, settings.detail, &mut random), learning_rate)?;
         meter.bar.inc(1);
 
         let is_due = |every: u64| step.is_multiple_of(every) || step == settings.steps;

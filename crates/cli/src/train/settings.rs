@@ -35,6 +35,9 @@ pub struct Settings {
     pub batch: u32,
     /// Rays per image.
     pub rays: u32,
+    /// Part of the rays drawn where a picture is not of one colour.
+    #[serde(default)]
+    pub detail: f64,
     /// Number of steps.
     pub steps: u64,
     /// Learning rate of Adam.
@@ -100,6 +103,9 @@ pub struct ForGood {
     /// Random rays per image; side² takes whole images [compact 256, paper side²].
     #[arg(long, value_name = "N", value_parser = up_to(u32::MAX))]
     rays: Option<u32>,
+    /// Part of the random rays drawn where a picture is not of one colour; the others fall anywhere [compact 0.5, paper 0].
+    #[arg(long, value_name = "PART", value_parser = part)]
+    detail: Option<f64>,
     /// Decides the first weights and every draw [0].
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -151,6 +157,13 @@ pub(super) fn positive(text: &str) -> std::result::Result<f64, String> {
     }
 }
 
+fn part(text: &str) -> std::result::Result<f64, String> {
+    match text.parse() {
+        Ok(value) if (0.0..=1.0).contains(&value) => Ok(value),
+        _ => Err("expected a number from 0 to 1".into()),
+    }
+}
+
 /// Overwrites the fields for which a flag was given.
 macro_rules! take {
     ($settings:ident, $flags:ident: $($field:ident),*) => {
@@ -174,6 +187,7 @@ impl Settings {
             views: is_paper.then_some(50),
             batch: if is_paper { 10 } else { 20 },
             rays: 0,
+            detail: if is_paper { 0.0 } else { 0.5 },
             steps: if is_paper { 100_000 } else { 14_000 },
             lr: if is_paper { 5e-5 } else { 5e-4 },
             decay: if is_paper { 1.0 } else { 0.1 },
@@ -186,7 +200,7 @@ impl Settings {
             executor: String::new(),
             memory: 0,
         };
-        take!(settings, for_good: hidden, latent, tracing_steps, side, batch, seed);
+        take!(settings, for_good: hidden, latent, tracing_steps, side, batch, detail, seed);
         take!(settings, for_good: log_every, validate_every, validation_views);
         settings.views = for_good.views.map(|views| views as usize).or(settings.views);
         settings.checkpoint_every = for_good.checkpoint_every;

@@ -1,0 +1,327 @@
+//! `sigma-pose evaluate --tables`: the paper's tables and its figure of convergence, for any model and data.
+
+use std::path::Path;
+use std::time::Instant;
+
+use glam::DMat4;
+use sigma_srn::{Engine, Loss, Model};
+use srn_data::camera::Axes;
+use srn_data::sheet::{self, CURVES, Curve};
+
+use super::evaluate::{Evaluate, ViewReport, pictures_sheet, view_report};
+use super::files::{Picture, create_dir, write_png};
+use super::notation::Notation;
+use super::search::{Found, LOSSES, PoseError, Preset, SearchArgs, Starts};
+use super::summary::{Statistics, Summary, markdown};
+use super::views::{self, Views, spread};
+use crate::common::{Result, load_model, load_set, progress, refuse_existing};
+use crate::train::adapt::{FitCodes, fit_codes};
+
+/// Files that are written.
+const FILES: [&str; 5] = ["tables.md", "views.csv", "convergence.csv", "convergence.png", "worst.png"];
+/// Searches on the page of the worst.
+const WORST: usize = 24;
+
+/// What a table's line tells about.
+#[derive(Clone)]
+struct Setting {
+    table: u32,
+    preset: Preset,
+    /// Of the paper's preset.
+    loss: Option<(&'static str, Loss)>,
+    starts: Starts,
+}
+
+impl Setting {
+    fn preset(&self) -> &'static str {
+        if self.preset == Preset::Paper { "paper" } else { "default" }
+    }
+
+    fn loss(&self) -> &'static str {
+        self.loss.map_or("charbonnier", |(name, _)| name)
+    }
+}
+
+/// Poses that were the best so far, at one evaluation: over all views.
+#[derive(Default)]
+struct Moment {
+    step: u32,
+    /// Since the search began, for one view.
+    seconds: f64,
+    errors: Vec<f64>,
+}
+
+/// All searches of a setting.
+struct Outcome {
+    setting: Setting,
+    views: Vec<ViewReport>,
+    moments: Vec<Moment>,
+}
+
+/// Everything that the searches share.
+struct Bench<'a> {
+    args: &'a Evaluate,
+    engine: Engine,
+    dir: &'a Path,
+    outcomes: Vec<Outcome>,
+}
+
+/// Measures, and writes the folder.
+pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
+    let model = load_model(&args.model)?;
+    let (side, asked) = views::open(&model, &args.data, args.instances, args.views)?;
+    args.search.with(Preset::Default, None)?;
+    let heldout = args.heldout.as_ref().map(|heldout| load_set(heldout, side)).transpose()?;
+    let paths = FILES.map(|file| dir.join(file));
+    refuse_existing(paths.clone(), args.force)?;
+    create_dir(dir)?;
+
+    let mut bench = Bench { args, engine: args.engine.open()?, dir, outcomes: vec![] };
+    let mae = LOSSES[0];
+    let setting = |table, preset, starts: &Starts| Setting {
+        table,
+        preset,
+        loss: (preset == Preset::Paper).then_some(mae),
+        starts: starts.clone(),
+    };
+    let few = |asked: &[Views]| few(asked, args.paper_views);
+    let mut worst = Vec::new();
+    for starts in [Starts::Neighbor4, Starts::Fixed24, Starts::Around84] {
+        worst.extend(bench.search(&model, side, &asked, setting(1, Preset::Default, &starts))?);
+    }
+    let pictures: Vec<(ViewReport, &Picture, Found)> =
+        worst.iter().map(|(report, picture, found)| (report.clone(), picture, found.clone())).collect();
+    write_png(&paths[4], &pictures_sheet(&pictures, side, WORST))?;
+    if let Some(mut heldout) = heldout {
+        heldout.instances = spread(heldout.instances, args.instances as usize);
+        let names = heldout.instances.iter().map(|instance| instance.name.clone()).collect();
+        let model = model.with_new_instances(names)?;
+        // Two views a quarter of the way from either end.
+        let fitted = |count: usize| [count / 4, count - 1 - count / 4];
+        let instances = || (0..).zip(&heldout.instances);
+        let shown: Vec<_> =
+            instances().flat_map(|(i, instance)| fitted(instance.views.len()).map(|k| (i, &instance.views[k]))).collect();
+        let model = fit_codes(&bench.engine, model, &shown, side, &FitCodes::default())?;
+        let unseen = instances().map(|(i, instance)| {
+            let others = instance.views.iter().enumerate().filter(|(k, _)| !fitted(instance.views.len()).contains(k));
+            let others: Vec<_> = others.map(|(_, view)| view.clone()).collect();
+            let views = spread(others, args.views as usize).into_iter().map(|view| views::picture(view, i, side));
+            let (pictures, truths) = views.unzip();
+            Views { name: instance.name.clone(), dir: args.data.join(&instance.name), pictures, truths }
+        });
+        let unseen: Vec<Views> = unseen.collect();
+        for starts in [Starts::Neighbor4, Starts::Fixed24, Starts::Around84] {
+            bench.search(&model, side, &unseen, setting(2, Preset::Default, &starts))?;
+        }
+        for starts in [Starts::Neighbor4, Starts::Fixed24] {
+            bench.search(&model, side, &few(&unseen), setting(2, Preset::Paper, &starts))?;
+        }
+    }
+    for loss in LOSSES {
+        bench.search(&model, side, &few(&asked), Setting { loss: Some(loss), ..setting(3, Preset::Paper, &Starts::Neighbor4) })?;
+    }
+    bench.search(&model, side, &few(&asked), setting(1, Preset::Paper, &Starts::Fixed24))?;
+    eprintln!("{} in {}", FILES.join(", "), dir.display());
+    Ok(true)
+}
+
+/// As many of the views, each instance's and each place's turn after the other.
+fn few(asked: &[Views], count: Option<u32>) -> Vec<Views> {
+    let count = count.map_or(usize::MAX, |count| count as usize);
+    let mut order: Vec<(usize, usize)> = Vec::new();
+    let longest = asked.iter().map(|views| views.pictures.len()).max().unwrap_or(0);
+    for round in 0..longest {
+        for (i, views) in asked.iter().enumerate().filter(|(_, views)| round < views.pictures.len()) {
+            order.push((i, (round + i) % views.pictures.len()));
+        }
+    }
+    order.truncate(count);
+    let chosen = asked.iter().enumerate().map(|(i, views)| {
+        let own = |k: &usize| order.contains(&(i, *k));
+        let of = (0..views.pictures.len()).filter(own);
+        let (pictures, truths) = of.map(|k| (views.pictures[k].clone(), views.truths[k])).unzip();
+        Views { name: views.name.clone(), dir: views.dir.clone(), pictures, truths }
+    });
+    chosen.filter(|views| !views.pictures.is_empty()).collect()
+}
+
+impl Bench<'_> {
+    /// Searches with a setting, and writes all files anew: hours of work are not lost with the last of them.
+    fn search(&mut self, model: &Model, side: u32, asked: &[Views], setting: Setting) -> Result<Vec<(ViewReport, Picture, Found)>> {
+        let search: SearchArgs = self.args.search.with(setting.preset, setting.loss.map(|(_, loss)| loss))?;
+        let steps: u64 = search.options()?.phases.iter().map(|phase| u64::from(phase.steps)).sum();
+        let bar = progress(steps * asked.len() as u64, "steps");
+        let (mut results, mut moments) = (Vec::new(), Vec::<Moment>::new());
+        for (i, Views { name, pictures, truths, .. }) in asked.iter().enumerate() {
+            bar.set_message(format!("{} {} {name}", setting.preset(), setting.starts));
+            let notation = Notation::default();
+            let starts = |(picture, truth): (&Picture, &DMat4)| {
+                search.starts(&setting.starts, model, picture, side, Some(truth), &notation)
+            };
+            let starts = pictures.iter().zip(truths).map(starts).collect::<Result<Vec<_>>>()?;
+            let (began, mut number) = (Instant::now(), 0);
+            let found = search.run(&self.engine, model, side, pictures, &starts, |progress| {
+                bar.set_position(i as u64 * steps + u64::from(progress.step));
+                let standing = progress.descent.standing()?;
+                if moments.len() == number {
+                    moments.push(Moment { step: progress.step, ..Moment::default() });
+                }
+                for (query, truth) in truths.iter().enumerate() {
+                    let own = standing.iter().zip(progress.hypotheses).filter(|(_, name)| name.0 == query);
+                    let best = own.min_by(|(a, _), (b, _)| a.0.total_cmp(&b.0)).expect("every query has a hypothesis");
+                    moments[number].errors.push(PoseError::of(&best.0.1.to_matrix(), truth).rotation_deg);
+                }
+                moments[number].seconds += began.elapsed().as_secs_f64();
+                number += 1;
+                Ok(())
+            })?;
+            for ((picture, truth), found) in pictures.iter().zip(truths).zip(found) {
+                let report = view_report(name, picture, truth, &found, Axes::OpenCv, None);
+                results.push((report, picture.clone(), found));
+            }
+        }
+        bar.finish_and_clear();
+        moments.iter_mut().for_each(|moment| moment.seconds /= moment.errors.len() as f64);
+        let views: Vec<ViewReport> = results.iter().map(|(report, ..)| report.clone()).collect();
+        let summary = Summary::of("", &views.iter().collect::<Vec<_>>());
+        eprintln!(
+            "table {}: {}, {}, {}: {} views, {:.2}° mean, {:.2}° median, {:.1} s a view",
+            setting.table,
+            setting.preset(),
+            setting.loss(),
+            setting.starts,
+            views.len(),
+            summary.rotation_deg.mean,
+            summary.rotation_deg.median,
+            summary.seconds_per_view
+        );
+        self.outcomes.push(Outcome { setting, views, moments });
+        self.write_files()?;
+        Ok(results)
+    }
+
+    fn write_files(&self) -> Result<()> {
+        let write = |file: &str, text: String| sigma_srn::write_atomically(&self.dir.join(file), text.as_bytes());
+        write(FILES[0], self.tables())?;
+        let mut rows = "table,preset,loss,starts,instance,view,rotation_deg,translation,oracle_deg,unexplained,converged,seconds\n".to_string();
+        let mut curves = "preset,loss,starts,step,seconds,rotation_deg_mean,rotation_deg_median\n".to_string();
+        for Outcome { setting, views, moments } in &self.outcomes {
+            let what = format!("{},{},{}", setting.preset(), setting.loss(), setting.starts);
+            for ViewReport { instance, view, error, oracle, unexplained, converged, seconds, .. } in views {
+                let (rotation, translation, oracle) = (error.rotation_deg, error.translation, oracle.rotation_deg);
+                let numbers = format!("{rotation},{translation},{oracle},{unexplained},{converged},{seconds}");
+                rows += &format!("{},{what},{instance},{view},{numbers}\n", setting.table);
+            }
+            for moment in moments.iter().filter(|_| setting.table != 2) {
+                let Statistics { mean, median, .. } = Statistics::of(moment.errors.iter().copied());
+                curves += &format!("{what},{},{},{mean},{median}\n", moment.step, moment.seconds);
+            }
+        }
+        write(FILES[1], rows)?;
+        write(FILES[2], curves)?;
+        Ok(write_png(&self.dir.join(FILES[3]), &self.convergence())?)
+    }
+
+    /// The tables in Markdown.
+    fn tables(&self) -> String {
+        let titles = [
+            "Table 1: unseen views of known objects",
+            "Table 2: objects that the model was not trained on, their codes fitted to two views",
+            "Table 3: losses, from `neighbor4`",
+        ];
+        let command: Vec<String> = std::env::args().skip(1).collect();
+        let mut text = format!("`sigma-pose {}`, {}.\n", command.join(" "), self.engine);
+        for (number, title) in (1..).zip(titles) {
+            let is_in = |setting: &Setting| {
+                // The lines of `neighbor4` with the presets' own losses are in two tables.
+                let shared = setting.table != 2 && setting.starts == Starts::Neighbor4;
+                setting.table == number || shared && (number == 3 || number == 1 && setting.loss() == "mae")
+            };
+            let mut outcomes: Vec<&Outcome> = self.outcomes.iter().filter(|outcome| is_in(&outcome.setting)).collect();
+            if outcomes.is_empty() {
+                continue;
+            }
+            outcomes.sort_by_key(|outcome| (outcome.setting.starts.to_string().len(), outcome.setting.preset()));
+            let head = "preset,loss,starts,views,rotation mean,95 %,median,<= 5°,<= 10°,oracle mean,translation mean,95 %,median,s/view";
+            let mut rows: Vec<Vec<String>> = vec![head.split(',').map(String::from).collect()];
+            for Outcome { setting, views, .. } in outcomes {
+                let s = Summary::of("", &views.iter().collect::<Vec<_>>());
+                let interval = |[low, high]: [f64; 2], digits: usize| format!("{low:.digits$} to {high:.digits$}");
+                rows.push(vec![
+                    setting.preset().into(),
+                    setting.loss().into(),
+                    setting.starts.to_string(),
+                    s.views.to_string(),
+                    format!("{:.2}°", s.rotation_deg.mean),
+                    interval(s.rotation_deg.mean_95, 2),
+                    format!("{:.2}°", s.rotation_deg.median),
+                    format!("{:.2}", s.recall_5_deg),
+                    format!("{:.2}", s.recall_10_deg),
+                    format!("{:.2}°", s.oracle_deg.mean),
+                    format!("{:.3}", s.translation.mean),
+                    interval(s.translation.mean_95, 3),
+                    format!("{:.3}", s.translation.median),
+                    format!("{:.2}", s.seconds_per_view),
+                ]);
+            }
+            text += &format!("\n{title}\n\n{}\n", markdown(&rows));
+        }
+        text
+    }
+
+    /// Median of the rotation error against steps, and against seconds.
+    fn convergence(&self) -> image::RgbImage {
+        let is_drawn = |setting: &Setting| setting.table != 2 && ["charbonnier", "mae"].contains(&setting.loss());
+        let outcomes: Vec<&Outcome> = self.outcomes.iter().filter(|outcome| is_drawn(&outcome.setting)).collect();
+        let plot = |title: &str, x: &dyn Fn(&Moment) -> f64| {
+            let points = |outcome: &&Outcome| -> Vec<(f64, f64)> {
+                let median = |moment: &Moment| Statistics::of(moment.errors.iter().copied()).median;
+                outcome.moments.iter().map(|moment| (x(moment), median(moment))).collect()
+            };
+            let lines: Vec<_> = outcomes.iter().map(points).collect();
+            let labels: Vec<String> =
+                outcomes.iter().map(|outcome| format!("{} {}", outcome.setting.preset(), outcome.setting.starts)).collect();
+            let curve = |(k, points): (usize, _)| Curve { label: labels[k].as_str(), points, colour: CURVES[k % CURVES.len()] };
+            let curves: Vec<Curve> = lines.iter().map(Vec::as_slice).enumerate().map(curve).collect();
+            sheet::plot_curve(title, &curves, [800, 400], true)
+        };
+        let by_step = plot("median rotation error in degrees, against steps", &|moment| moment.step.into());
+        let by_time = plot("the same against seconds a view, their decimal logarithm", &|moment| moment.seconds.log10());
+        sheet::grid(&[(&by_step, ""), (&by_time, "")], 1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sigma_srn::Intrinsics;
+
+    #[test]
+    fn few_views_come_from_all_instances_and_places() {
+        let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pixel_center: 0.0 };
+        let picture = |name: usize| Picture {
+            name: name.to_string(),
+            instance: 0,
+            rgb: vec![],
+            weights: None,
+            intrinsics,
+            truth: None,
+            distance: None,
+            square: ([0; 2], 1),
+        };
+        let views = |name: &str| Views {
+            name: name.into(),
+            dir: name.into(),
+            pictures: (0..3).map(picture).collect(),
+            truths: vec![DMat4::IDENTITY; 3],
+        };
+        let asked = [views("a"), views("b")];
+        let names = |count| -> Vec<String> {
+            let of = |views: &Views| views.pictures.iter().map(|p| format!("{}{}", views.name, p.name)).collect::<Vec<_>>();
+            few(&asked, count).iter().flat_map(of).collect()
+        };
+        assert_eq!(names(Some(1)), ["a0"]);
+        assert_eq!(names(Some(3)), ["a0", "a1", "b1"]);
+        assert_eq!(names(None).len(), 6);
+    }
+}

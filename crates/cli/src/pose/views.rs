@@ -1,0 +1,80 @@
+//! The views of a data set that poses are searched for.
+
+use std::path::{Path, PathBuf};
+
+use glam::DMat4;
+use sigma_srn::{Intrinsics, Model};
+use srn_data::LoadedView;
+use srn_data::srn::SrnSet;
+
+use super::files::{Picture, model_side};
+use crate::common::{Result, camera};
+
+/// Views of one instance.
+pub struct Views {
+    /// Name of the instance.
+    pub name: String,
+    /// Its folder.
+    pub dir: PathBuf,
+    /// The views.
+    pub pictures: Vec<Picture>,
+    /// Their true poses.
+    pub truths: Vec<DMat4>,
+}
+
+/// Side of the model's images, and at most `views` views of at most `instances` instances that the model knows by name; both evenly
+/// spread over those that there are.
+pub fn open(model: &Model, data: &Path, instances: u32, views: u32) -> Result<(u32, Vec<Views>)> {
+    let mut known = SrnSet::open(data)?.instances;
+    let found = known.len();
+    known.retain(|files| model.instance(&files.name).is_ok());
+    if known.is_empty() {
+        let names = model.metadata.instance_names.join(", ");
+        return Err(format!("{}: none of its {found} instances is in the model, which knows {names}", data.display()).into());
+    }
+    if known.len() < found {
+        eprintln!("{} of {found} instances are not in the model and are left out", found - known.len());
+    }
+    let mut known = spread(known, instances as usize);
+    for files in &mut known {
+        files.views = spread(std::mem::take(&mut files.views), views as usize);
+    }
+    let first = known.iter().flat_map(|files| &files.views).find_map(|view| view.rgb.as_deref());
+    let side = model_side(model, first.unwrap_or(data))?;
+    let mut all = Vec::new();
+    for files in &known {
+        let instance = model.instance(&files.name)?;
+        let views = files.load(side as usize)?.views.into_iter().map(|view| picture(view, instance, side));
+        let (pictures, truths) = views.unzip();
+        all.push(Views { name: files.name.clone(), dir: files.dir.clone(), pictures, truths });
+    }
+    Ok((side, all))
+}
+
+/// A view as a picture that is searched for, and its true pose.
+pub fn picture(view: LoadedView, instance: u32, side: u32) -> (Picture, DMat4) {
+    let (truth, intrinsics): (DMat4, Intrinsics) = camera(&view);
+    let LoadedView { name, rgb, .. } = view;
+    let square = ([0; 2], side as usize);
+    (Picture { name, instance, rgb, weights: None, intrinsics, truth: Some(truth), distance: None, square }, truth)
+}
+
+/// `n` of the items, evenly spaced; the first among them.
+pub fn spread<T>(items: Vec<T>, n: usize) -> Vec<T> {
+    let (len, n) = (items.len(), n.min(items.len()));
+    let chosen: Vec<usize> = (0..n).map(|k| k * len / n).collect();
+    items.into_iter().enumerate().filter(|(i, _)| chosen.contains(i)).map(|(_, item)| item).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn views_are_spread_evenly() {
+        assert_eq!(spread((0..20).collect(), 4), [0, 5, 10, 15]);
+        assert_eq!(spread((0..3).collect(), 10), [0, 1, 2]);
+        assert_eq!(spread((0..7).collect(), 3), [0, 2, 4]);
+        assert!(spread(Vec::<u8>::new(), 3).is_empty());
+    }
+}
