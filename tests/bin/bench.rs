@@ -1,5 +1,5 @@
 //! `bench [--quick] [--json] [--write]`: what a pose step, a training step and a picture cost on every executor, beside the rate
-//! that the matrix library reaches in the same run. `--write` puts the tables into `docs/performance.md`.
+//! that the matrix library reaches in the same run, and beside PyTorch where `python3` (or the interpreter that `PYTHON` names) has it. `--write` puts the tables into `docs/performance.md`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,6 +11,7 @@ use sigma_srn::{
     TrainingBatch, camera, pixel_grid, stream,
 };
 use srn_tests::between;
+use srn_tests::peer::{Peer, PeerRow};
 
 const USAGE: &str = "usage: bench [--quick] [--json] [--write]";
 const SIDE: u32 = 64;
@@ -91,6 +92,8 @@ fn run() -> Result<()> {
     }
     let hardware = hardware(&engines);
     eprintln!("{hardware}");
+    let peer = Peer::find();
+    let (mut peer_on, mut peer_rows) = (String::new(), Vec::new());
     let (mut rows, mut kernels, mut ceilings, mut scaling) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     // The small nets first: the kernels of the large ones are compiled then.
     for width in if quick { vec![64] } else { vec![64, 256] } {
@@ -123,16 +126,25 @@ fn run() -> Result<()> {
                 }
             }
         }
+        if let Some(peer) = &peer {
+            let (on, measured) = peer.time(width)?;
+            measured.iter().for_each(|row| {
+                eprintln!("PyTorch {}, {}: {} at width {} in {:.3} s", row.device, row.version, row.work, row.width, row.seconds)
+            });
+            peer_on = on;
+            peer_rows.extend(measured);
+        }
     }
     let ceiling = median(&mut ceilings);
+    let mut text = report(&hardware, ceiling, &rows, &scaling, &kernels);
+    text += &against_pytorch(&peer_on, &peer_rows, &rows);
     if json {
-        println!("{:#}", as_json(&hardware, ceiling, &rows, &scaling, &kernels));
+        println!("{:#}", as_json(&hardware, ceiling, &rows, &scaling, &kernels, &peer_rows));
     } else {
-        println!("{}", report(&hardware, ceiling, &rows, &scaling, &kernels));
+        println!("{text}");
     }
     if has("--write") {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/performance.md");
-        let text = report(&hardware, ceiling, &rows, &scaling, &kernels);
         let new = between::replace(&std::fs::read_to_string(&path)?, "bench", &text)?;
         std::fs::write(&path, new)?;
     }
@@ -350,7 +362,36 @@ fn report(hardware: &str, ceiling: f64, rows: &[Row], scaling: &[Scaling], kerne
     text
 }
 
-fn as_json(hardware: &str, ceiling: f64, rows: &[Row], scaling: &[Scaling], kernels: &[KernelRow]) -> serde_json::Value {
+/// The same steps in PyTorch, and how many times faster ours are.
+fn against_pytorch(ran_on: &str, peers: &[PeerRow], rows: &[Row]) -> String {
+    if peers.is_empty() {
+        return String::new();
+    }
+    let mut text = format!(
+        "\nThe same steps in PyTorch (`bench/peer.py`), in the same run: {ran_on}. `as released`: f is evaluated again for the sum, as in the authors' code; `kept`: it is not.\n\n"
+    );
+    text += "| work | width | PyTorch on | version | PyTorch | ours, cpu | faster | ours, gpu | faster |\n|---|---|---|---|---|---|---|---|---|\n";
+    for peer in peers {
+        let ours = |executor: &str| {
+            let is_it = |row: &&Row| row.width == peer.width && row.executor == executor && row.what.starts_with(&peer.work);
+            // The first of a kind: Adam, and the default budget.
+            let seconds = rows.iter().find(is_it).map(|row| row.seconds);
+            seconds.map_or(" | ".into(), |seconds| format!("{seconds:.3} s | {:.2}", peer.seconds / seconds))
+        };
+        let PeerRow { work, width, version, seconds, device } = peer;
+        text += &format!("| {work} | {width} | {device} | {version} | {seconds:.3} s | {} | {} |\n", ours("cpu"), ours("gpu"));
+    }
+    text
+}
+
+fn as_json(
+    hardware: &str,
+    ceiling: f64,
+    rows: &[Row],
+    scaling: &[Scaling],
+    kernels: &[KernelRow],
+    peers: &[PeerRow],
+) -> serde_json::Value {
     let scaling: Vec<_> = scaling
         .iter()
         .map(|row| {
@@ -377,5 +418,5 @@ fn as_json(hardware: &str, ceiling: f64, rows: &[Row], scaling: &[Scaling], kern
             })
         })
         .collect();
-    serde_json::json!({ "hardware": hardware, "sgemm_flops_per_second": ceiling, "rows": rows, "scaling": scaling, "kernels": kernels })
+    serde_json::json!({ "hardware": hardware, "sgemm_flops_per_second": ceiling, "rows": rows, "scaling": scaling, "kernels": kernels, "pytorch": peers })
 }

@@ -7,6 +7,7 @@ mod close;
 mod device;
 pub mod golden;
 mod lockstep;
+pub mod peer;
 pub mod table;
 
 pub use case::{Case, Sketch};

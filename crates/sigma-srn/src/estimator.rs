@@ -10,6 +10,9 @@ use crate::model::Model;
 use crate::random::{initial_depths, stream};
 use crate::{Error, Rays, pixel_grid};
 
+/// How far starts are turned that the search adds, about as far as it finds back.
+const TURN: f64 = 30.0 * std::f64::consts::PI / 180.0;
+
 /// An image whose camera pose is wanted.
 #[derive(Clone, Debug)]
 pub struct Query {
@@ -46,6 +49,9 @@ pub struct Phase {
 pub struct Options {
     /// How hypotheses move.
     pub method: Method,
+    /// Where an image has fewer starts than this, six more are tried around each, turned by 30° about the object: to either side about each
+    /// axis of the camera.
+    pub min_starts: usize,
     /// Phases, one after the other.
     pub phases: Vec<Phase>,
     /// Seed of the initial depths.
@@ -62,7 +68,7 @@ impl Default for Options {
             Phase { steps: 8, stride: 2, keep: 6 },
             Phase { steps: 14, stride: 1, keep: 3 },
         ];
-        Options { method: Method::Bfgs { soft: 0.3 }, phases, seed: 0 }
+        Options { method: Method::Bfgs { soft: 0.3 }, min_starts: 84, phases, seed: 0 }
     }
 }
 
@@ -70,7 +76,7 @@ impl Options {
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
     pub fn paper() -> Self {
         let method = Method::Adam { loss: Loss::Mae, learning_rate: 0.1 };
-        Options { method, phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX }], seed: 0 }
+        Options { method, min_starts: 0, phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX }], seed: 0 }
     }
 
     /// The same with `steps` steps in all, shared between the phases in their present proportions.
@@ -92,8 +98,9 @@ impl Options {
         self
     }
 
-    /// The same with all starts in every phase.
+    /// The same with all starts, and no others, in every phase.
     pub fn without_culling(mut self) -> Self {
+        self.min_starts = 0;
         self.phases.iter_mut().for_each(|phase| phase.keep = usize::MAX);
         self
     }
@@ -113,7 +120,7 @@ impl Options {
 /// Where one start ended.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Ranked {
-    /// Number of the start in [`Query::starts`].
+    /// Number of the start in [`Query::starts`]; beyond those, of one that was added, see [`Options::min_starts`].
     pub start: usize,
     /// Its loss when it was dropped, or at the end; infinite where it was not a number.
     pub loss: f64,
@@ -178,7 +185,9 @@ pub fn estimate(
             let pose = Pose6::from_matrix(matrix);
             Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, phases: 0 }
         };
-        hypotheses.extend(q.starts.iter().enumerate().map(new));
+        let around = (q.starts.len() < options.min_starts).then(|| q.starts.iter().flat_map(turned));
+        let starts: Vec<DMat4> = q.starts.iter().copied().chain(around.into_iter().flatten()).collect();
+        hypotheses.extend(starts.iter().enumerate().map(new));
     }
 
     for (number, phase) in options.phases.iter().enumerate() {
@@ -236,6 +245,14 @@ pub fn estimate(
         estimates.push(Estimate { pose, loss, curvature, ranking: own.iter().map(ranked).collect() });
     }
     Ok(estimates)
+}
+
+/// A camera turned about the object by 30°, to either side about each of its axes.
+fn turned(world_from_camera: &DMat4) -> impl Iterator<Item = DMat4> {
+    let axes = [world_from_camera.x_axis, world_from_camera.y_axis, world_from_camera.z_axis];
+    let turns =
+        axes.into_iter().flat_map(|axis| [-TURN, TURN].map(|angle| DMat4::from_axis_angle(axis.truncate().normalize(), angle)));
+    turns.map(|turn| turn * *world_from_camera)
 }
 
 fn rays_of(query: &Query, stride: u32) -> impl Iterator<Item = (u32, u32)> {

@@ -7,6 +7,7 @@
 //! (the object's bounding-box diagonal is 1), colours in [-1, 1].
 
 pub mod camera;
+pub mod confidence;
 mod descent;
 mod engine;
 mod error;
@@ -20,6 +21,7 @@ mod torch;
 mod trainer;
 
 pub use camera::{Intrinsics, Pose6};
+pub use confidence::Calibration;
 pub use descent::{Descent, Loss, Method, Shape};
 pub use engine::Engine;
 pub use error::Error;

@@ -7,6 +7,7 @@ use rand::RngExt;
 use safetensors::SafeTensorError;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
+use crate::confidence::Calibration;
 use crate::random::{Random, normal, stream};
 use crate::{Error, renderer};
 
@@ -141,6 +142,8 @@ pub struct Metadata {
     pub side: Option<u32>,
     /// Distance of the training cameras from the origin in object units, if known.
     pub orbit_radius: Option<f64>,
+    /// How its estimates compare with known poses, if that was measured.
+    pub calibration: Option<Calibration>,
 }
 
 /// Where the shapes of a layout come from: a file's tensors, or a configuration.
@@ -385,12 +388,16 @@ impl Model {
             Some(Ok(steps)) if steps >= 1.0 && steps.fract() == 0.0 => steps as u32,
             _ => return Err(format("metadata `tracing_steps` must be a whole number of at least 1".into())),
         };
-        let instance_names: Vec<String> = match text.get("instance_names") {
-            Some(names) => serde_json::from_str(names).map_err(|error| format(format!("metadata `instance_names`: {error}")))?,
-            None => Vec::new(),
+        let json = |key: &str| text.get(key).map_or("null", String::as_str);
+        let wrong = |key: &str, error: serde_json::Error| format(format!("metadata `{key}`: {error}"));
+        let instance_names: Option<Vec<String>> =
+            serde_json::from_str(json("instance_names")).map_err(|error| wrong("instance_names", error))?;
+        let metadata = Metadata {
+            instance_names: instance_names.unwrap_or_default(),
+            side: number("side").and_then(Result::ok).map(|side| side as u32),
+            orbit_radius: number("orbit_radius").and_then(Result::ok),
+            calibration: serde_json::from_str(json("calibration")).map_err(|error| wrong("calibration", error))?,
         };
-        let side = number("side").and_then(Result::ok).map(|side| side as u32);
-        let metadata = Metadata { instance_names, side, orbit_radius: number("orbit_radius").and_then(Result::ok) };
         Self::from_tensors(&tensors, tracing_steps, metadata)
     }
 
@@ -480,6 +487,9 @@ impl Model {
         }
         if let Some(radius) = self.metadata.orbit_radius {
             text.insert("orbit_radius".into(), radius.to_string());
+        }
+        if let Some(calibration) = self.metadata.calibration {
+            text.insert("calibration".into(), serde_json::json!(calibration).to_string());
         }
         text
     }

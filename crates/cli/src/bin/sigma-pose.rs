@@ -4,11 +4,11 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use sigma_cli::common::finish;
-use sigma_cli::pose::{bake, estimate, evaluate, render};
+use sigma_cli::pose::{bake, calibrate, estimate, evaluate, render};
 
 /// Camera poses of pictures by gradient descent through a neural renderer.
 ///
-/// Exit status: 0 done, 1 `estimate` did not find a pose, 2 an error.
+/// Exit status: 0 done, 1 `estimate` found a pose that is not to be trusted, 2 an error.
 #[derive(Parser)]
 #[command(version, about)]
 struct Cli {
@@ -18,10 +18,12 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Find the poses of pictures. Exit status 1 if one of them is not found; see --accept.
+    /// Find the poses of pictures. Exit status 1 if one of them is not to be trusted; see --accept.
     Estimate(estimate::Estimate),
     /// Measure the errors on a data set, by the paper's protocol.
     Evaluate(evaluate::Evaluate),
+    /// Compare estimates with known poses, so that others come with standard deviations and a verdict.
+    Calibrate(calibrate::Calibrate),
     /// Render an object from any side.
     Render(render::Render),
     /// Write one object's networks to a small file of their own, which goes wherever a model goes but into training.
@@ -32,6 +34,7 @@ fn main() -> ExitCode {
     finish(match Cli::parse().command {
         Command::Estimate(args) => estimate::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Bake(args) => bake::run(&args),
     })

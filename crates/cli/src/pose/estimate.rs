@@ -13,7 +13,7 @@ use super::files::{CameraArgs, Picture, PoseSource, create_dir, mask_of, model_s
 use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
-use super::search::{Found, PoseError, SearchArgs, Starts};
+use super::search::{Confidence, Found, PoseError, SearchArgs, Starts};
 use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
 
 /// Flags of `sigma-pose estimate`.
@@ -90,13 +90,26 @@ struct ImageReport {
     loss: f64,
     /// See [`Found::unexplained`].
     unexplained: f64,
-    converged: bool,
+    trusted: bool,
+    /// If the model is calibrated.
+    confidence: Option<Confidence>,
+    /// The best pose elsewhere that the search followed to the end.
+    rival: Option<Rival>,
     /// Number of the winning start.
     start: usize,
     error: Option<PoseError>,
     /// All starts, the winner first.
     ranking: Vec<RankedReport>,
     seconds: f64,
+}
+
+#[derive(Serialize)]
+struct Rival {
+    start: usize,
+    /// By which part its loss is higher.
+    higher: f64,
+    /// Rows, like those of the estimate.
+    world_from_camera: [[f64; 4]; 4],
 }
 
 #[derive(Serialize)]
@@ -107,7 +120,7 @@ struct RankedReport {
     error: Option<PoseError>,
 }
 
-/// Runs the command; false where a picture's search did not converge.
+/// Runs the command; false where a pose is not to be trusted.
 pub fn run(args: &Estimate) -> Result<bool> {
     let model = load_model(&args.model)?;
     let side = model_side(&model, &args.images[0])?;
@@ -152,7 +165,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
         }
         eprintln!("pictures in {}", dir.display());
     }
-    Ok(found.iter().all(|found| found.converged))
+    Ok(found.iter().all(|found| found.trusted))
 }
 
 /// One of `things` per image, of which there are none, one or as many.
@@ -204,6 +217,11 @@ fn report(
             phases: r.phases,
             error: error(&r.pose.to_matrix()),
         };
+        let rival = |(r, higher): (&sigma_srn::Ranked, f64)| Rival {
+            start: r.start,
+            higher,
+            world_from_camera: convention.of_ours(r.pose.to_matrix()).transpose().to_cols_array_2d(),
+        };
         ImageReport {
             image: image.clone(),
             instance: model.instance_name(picture.instance),
@@ -213,7 +231,9 @@ fn report(
             translation: [x, y, z],
             loss: found.estimate.loss,
             unexplained: found.unexplained,
-            converged: found.converged,
+            trusted: found.trusted,
+            confidence: found.confidence,
+            rival: found.estimate.rival().map(rival),
             start: found.estimate.ranking[0].start,
             error: error(&found.world_from_camera),
             ranking: found.estimate.ranking.iter().map(ranked).collect(),
@@ -233,10 +253,11 @@ impl ImageReport {
     fn line(&self, pose: &Pose6) -> String {
         let [a, b, c, x, y, z] = pose.0;
         let [a, b, c] = [a, b, c].map(f64::to_degrees);
-        let verdict = if self.converged { "" } else { "  NOT CONVERGED" };
+        let verdict = if self.trusted { "" } else { "  DO NOT TRUST" };
+        let deviation = self.confidence.map_or(String::new(), |c| format!("  ± {:.2}° {:.4}", c.rotation_deg, c.translation));
         let error = self.error.map_or(String::new(), |error| format!("  error {error}"));
         format!(
-            "{}  {}  rotation {a:.2}° {b:.2}° {c:.2}°  centre {x:.4} {y:.4} {z:.4}  loss {:.4}  unexplained {:.0} %  \
+            "{}  {}  rotation {a:.2}° {b:.2}° {c:.2}°  centre {x:.4} {y:.4} {z:.4}{deviation}  loss {:.4}  unexplained {:.0} %  \
              start {} of {}  {:.1} s{error}{verdict}",
             self.image.display(),
             self.instance,

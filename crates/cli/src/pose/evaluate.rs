@@ -5,13 +5,14 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
+use sigma_srn::Model;
 use srn_data::camera::Axes;
 use srn_data::sheet;
 
 use super::draw;
 use super::files::{Picture, create_dir, write_png};
 use super::notation::{Notation, NotationArgs};
-use super::search::{Found, PoseError, SearchArgs, Starts};
+use super::search::{Confidence, Found, PoseError, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::tables;
 use super::views::{self, Views};
@@ -97,7 +98,12 @@ pub(super) struct ViewReport {
     pub start: usize,
     pub loss: f64,
     pub unexplained: f64,
-    pub converged: bool,
+    pub trusted: bool,
+    pub confidence: Option<Confidence>,
+    /// Whether the true pose lies within the stated 95 % ellipsoid.
+    pub within_95: Option<bool>,
+    /// By which part the loss is higher at the best pose elsewhere.
+    pub rival_higher: Option<f64>,
     pub seconds: f64,
     /// Rows of the estimate.
     pub world_from_camera: [[f64; 4]; 4],
@@ -139,7 +145,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
         })?;
         let reports = pictures.iter().zip(*truths).zip(found);
         for ((picture, truth), found) in reports {
-            let report = view_report(name, picture, truth, &found, notation.axes, source.as_ref());
+            let report = view_report(&model, name, picture, truth, &found, notation.axes, source.as_ref());
             results.push((report, picture, found));
         }
     }
@@ -168,6 +174,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
 
 /// What there is to say about a search.
 pub(super) fn view_report(
+    model: &Model,
     instance: &str,
     picture: &Picture,
     truth: &DMat4,
@@ -177,6 +184,7 @@ pub(super) fn view_report(
 ) -> ViewReport {
     let errors = found.estimate.ranking.iter().map(|r| PoseError::of(&r.pose.to_matrix(), truth));
     let error = PoseError::of(&found.world_from_camera, truth);
+    let within_95 = model.metadata.calibration.and_then(|calibration| found.estimate.states(truth, &calibration));
     ViewReport {
         instance: instance.into(),
         view: picture.name.clone(),
@@ -186,7 +194,10 @@ pub(super) fn view_report(
         start: found.estimate.ranking[0].start,
         loss: found.estimate.loss,
         unexplained: found.unexplained,
-        converged: found.converged,
+        trusted: found.trusted,
+        confidence: found.confidence,
+        within_95,
+        rival_higher: found.estimate.rival().map(|(_, higher)| higher),
         seconds: found.seconds,
         world_from_camera: convention.of_ours(found.world_from_camera).transpose().to_cols_array_2d(),
         source_from_camera: source.map(|source| source.rows(&found.world_from_camera)),
@@ -218,7 +229,27 @@ pub(super) fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u3
     page
 }
 
+impl ViewReport {
+    /// More than 5° off, which the paper's protocol does not count as found.
+    pub(super) fn is_failure(&self) -> bool {
+        self.error.rotation_deg > PoseError::FAILURE_DEG
+    }
+}
+
 impl Report {
+    /// What the verdicts and the stated deviations were worth.
+    fn verdicts(&self) -> String {
+        let Summary { views, trusted, failures, failures_told, stated, within_95, .. } = self.overall;
+        let (not, failure) = (views - trusted, PoseError::FAILURE_DEG);
+        let mut text = format!(
+            "{failures} of {views} are more than {failure}° off; {not} are not trusted, {failures_told} of them with reason"
+        );
+        if stated > 0 {
+            text += &format!("; the truth lies within the stated 95 % ellipsoid of {within_95} of {stated}");
+        }
+        text
+    }
+
     /// A table in Markdown, aligned; with errors in the source's unit where it is known.
     fn table(&self) -> String {
         let degrees = |x: f64| format!("{x:.2}°");
@@ -235,7 +266,7 @@ impl Report {
             ("tra mean", Box::new(|s| format!("{:.3}", s.translation.mean))),
             ("median", Box::new(|s| format!("{:.3}", s.translation.median))),
             ("% of distance", Box::new(|s| format!("{:.2}", s.translation_percent.median))),
-            ("converged", Box::new(|s| s.converged.to_string())),
+            ("trusted", Box::new(|s| s.trusted.to_string())),
             ("s/view", Box::new(|s| format!("{:.2}", s.seconds_per_view))),
         ];
         if self.overall.translation_source.is_some() {
@@ -250,7 +281,7 @@ impl Report {
         let row = |s: &Summary| columns.iter().map(|(_, cell)| cell(s)).collect::<Vec<_>>();
         let mut rows = vec![columns.iter().map(|(head, _)| head.to_string()).collect()];
         rows.extend(self.instances.iter().chain([&self.overall]).map(row));
-        markdown(&rows)
+        markdown(&rows) + "\n\n" + &self.verdicts()
     }
 }
 

@@ -8,8 +8,10 @@ use clap::{Args, ValueEnum};
 use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
 use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
+use sigma_srn::confidence::deviations;
 use sigma_srn::{
-    Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer, Rendering, estimate,
+    Calibration, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer, Rendering,
+    estimate,
 };
 
 use super::files::Picture;
@@ -17,6 +19,8 @@ use super::notation::Notation;
 use super::positive;
 use crate::common::Result;
 
+/// What `--accept` is for a model without a calibration.
+const ACCEPT: f64 = 0.25;
 /// Views that are rendered at once.
 const RENDER_BATCH: usize = 8;
 
@@ -49,12 +53,11 @@ pub struct SearchArgs {
     /// Decides the random initial depths of the rays.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// A pose counts as found if the view from there leaves at most this part of the picture unexplained: the sum of absolute
-    /// differences, over that to an empty picture. (What looks alike from two sides can be found from the wrong one.)
-    // With the asset model and an earlier search (Adam), 62 of 63 searches ended within 5° and left 0.03 to 0.19, the other one, 9° off, 0.33; 12 searches for
-    // the wrong object left 0.32 to 0.60.
-    #[arg(long, value_name = "X", default_value_t = 0.25, value_parser = positive)]
-    accept: f64,
+    /// A pose is trusted if the view from there leaves at most this part of the picture unexplained: the sum of absolute differences, over
+    /// that to an empty picture. Default: what `calibrate` has found for the model, else 0.25. With the default, what looks alike from two
+    /// sides is not trusted either if `calibrate` saw the search mistake them.
+    #[arg(long, value_name = "X", value_parser = positive)]
+    accept: Option<f64>,
     /// Distance of the starts of `around84` and `fixed24` from the object's centre, in object units. Default: by the size of the object in a
     /// photograph that is cut around it, else as the model was trained.
     #[arg(long, value_name = "R", value_parser = positive)]
@@ -117,7 +120,10 @@ impl SearchArgs {
     pub fn with(&self, preset: Preset, loss: Option<Loss>) -> Result<Self> {
         let is_plain = self.preset == Preset::Default && self.loss.is_none() && self.lr.is_none() && self.steps.is_none();
         if !is_plain || self.cull || self.no_cull || self.stride.is_some() {
-            return Err("--tables compares the presets as they are: of the flags of the search it takes --radius, --seed and --accept".into());
+            return Err(
+                "--tables compares the presets as they are: of the flags of the search it takes --radius, --seed and --accept"
+                    .into(),
+            );
         }
         Ok(SearchArgs { preset, loss, ..self.clone() })
     }
@@ -179,10 +185,24 @@ impl SearchArgs {
         let renders = render(engine, model, side, &views)?;
         let found = estimates.into_iter().zip(renders).zip(pictures).map(|((estimate, render), picture)| {
             let unexplained = unexplained(picture, &render.rgb);
-            let converged = estimate.loss.is_finite() && unexplained <= self.accept;
-            Found { world_from_camera: estimate.pose.to_matrix(), estimate, rgb: render.rgb, unexplained, converged, seconds }
+            let trusted = self.trusts(model, &estimate, unexplained);
+            let confidence = model.metadata.calibration.as_ref().and_then(|calibration| Confidence::of(&estimate, calibration));
+            let world_from_camera = estimate.pose.to_matrix();
+            Found { world_from_camera, estimate, rgb: render.rgb, unexplained, trusted, confidence, seconds }
         });
         Ok(found.collect())
+    }
+
+    /// Whether an estimate is to be trusted.
+    fn trusts(&self, model: &Model, estimate: &Estimate, unexplained: f64) -> bool {
+        let explains = |most: f64| estimate.loss.is_finite() && unexplained <= most;
+        match (self.accept, &model.metadata.calibration) {
+            (Some(most), _) => explains(most),
+            (None, Some(calibration)) => {
+                explains(calibration.unexplained) && estimate.rival().is_none_or(|(_, higher)| higher >= calibration.rival)
+            }
+            (None, None) => explains(ACCEPT),
+        }
     }
 
     /// Starts all around the object, turned so that it appears in the middle of the picture: a cut may lie anywhere beside the
@@ -231,10 +251,32 @@ pub struct Found {
     /// The part of the picture that the render leaves unexplained: the sum of absolute differences to the render, over that to
     /// an empty (white) picture, of the pixels that count. 0: equal; 1: no better than nothing.
     pub unexplained: f64,
-    /// Whether the loss is finite, and that little enough.
-    pub converged: bool,
+    /// Whether the loss is finite, that is little enough, and no pose elsewhere does nearly as well.
+    pub trusted: bool,
+    /// How far off the pose may be, if the model is calibrated.
+    pub confidence: Option<Confidence>,
     /// Seconds of the search, a picture's share of its batch.
     pub seconds: f64,
+}
+
+/// How far off a pose may be, provided that it is no other one altogether.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Confidence {
+    /// Standard deviation of the rotation about all axes, degrees.
+    pub rotation_deg: f64,
+    /// Standard deviation of the camera's place, object units.
+    pub translation: f64,
+    /// Covariance of the motion from the estimate to the truth: a turn about the object's centre (rad), then a shift (object units), both in
+    /// the axes (OpenCV's) of the estimated camera.
+    pub covariance: [[f64; 6]; 6],
+}
+
+impl Confidence {
+    fn of(estimate: &Estimate, calibration: &Calibration) -> Option<Self> {
+        let covariance = estimate.covariance(calibration)?;
+        let (rotation_deg, translation) = deviations(&estimate.pose.to_matrix(), &covariance);
+        Some(Confidence { rotation_deg, translation, covariance })
+    }
 }
 
 /// Distance of a pose from the truth.
@@ -249,6 +291,9 @@ pub struct PoseError {
 }
 
 impl PoseError {
+    /// Rotation error above which a search has failed, degrees: the paper's first recall.
+    pub const FAILURE_DEG: f64 = 5.0;
+
     /// Of `pose` against `truth`.
     pub fn of(pose: &DMat4, truth: &DMat4) -> Self {
         let (rotation_deg, translation) = pose_error(pose, truth);

@@ -14,7 +14,14 @@ const DRAWS: usize = 4000;
 pub struct Summary {
     pub name: String,
     pub views: usize,
-    pub converged: usize,
+    /// Estimates that were trusted.
+    pub trusted: usize,
+    /// Of the failures, the estimates more than 5° off, those that were not trusted.
+    pub failures: usize,
+    pub failures_told: usize,
+    /// Views of a calibrated model, and those of them whose true pose lies within the stated 95 % ellipsoid.
+    pub stated: usize,
+    pub within_95: usize,
     pub rotation_deg: Statistics,
     pub translation: Statistics,
     pub translation_percent: Statistics,
@@ -45,8 +52,7 @@ impl Statistics {
         let n = values.len();
         let mean = |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / n as f64;
         let mut random = stream(0, 0);
-        let mut draws: Vec<f64> =
-            (0..DRAWS).map(|_| mean(&mut (0..n).map(|_| values[random.random_range(0..n)]))).collect();
+        let mut draws: Vec<f64> = (0..DRAWS).map(|_| mean(&mut (0..n).map(|_| values[random.random_range(0..n)]))).collect();
         draws.sort_by(f64::total_cmp);
         Statistics {
             mean: mean(&mut values.iter().copied()),
@@ -61,11 +67,16 @@ impl Summary {
     pub fn of(name: &str, views: &[&ViewReport]) -> Self {
         let n = views.len() as f64;
         let in_source: Option<Vec<f64>> = views.iter().map(|view| view.translation_source).collect();
+        let count = |is: &dyn Fn(&ViewReport) -> bool| views.iter().filter(|view| is(view)).count();
         let part = |limit: f64| views.iter().filter(|view| view.error.rotation_deg <= limit).count() as f64 / n;
         Summary {
             name: name.into(),
             views: views.len(),
-            converged: views.iter().filter(|view| view.converged).count(),
+            trusted: count(&|view| view.trusted),
+            failures: count(&|view| view.is_failure()),
+            failures_told: count(&|view| view.is_failure() && !view.trusted),
+            stated: count(&|view| view.within_95.is_some()),
+            within_95: count(&|view| view.within_95 == Some(true)),
             rotation_deg: Statistics::of(views.iter().map(|view| view.error.rotation_deg)),
             translation: Statistics::of(views.iter().map(|view| view.error.translation)),
             translation_percent: Statistics::of(views.iter().map(|view| view.error.translation_percent)),

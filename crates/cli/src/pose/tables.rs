@@ -19,6 +19,8 @@ use crate::train::adapt::{FitCodes, fit_codes};
 
 /// Files that are written.
 const FILES: [&str; 5] = ["tables.md", "views.csv", "convergence.csv", "convergence.png", "worst.png"];
+/// In the order of the tables; the paper's preset is tried from the first two, which are the paper's.
+const STARTS: [Starts; 3] = [Starts::Neighbor4, Starts::Fixed24, Starts::Around84];
 /// Searches on the page of the worst.
 const WORST: usize = 24;
 
@@ -86,7 +88,7 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     };
     let few = |asked: &[Views]| few(asked, args.paper_views);
     let mut worst = Vec::new();
-    for starts in [Starts::Neighbor4, Starts::Fixed24, Starts::Around84] {
+    for starts in STARTS {
         worst.extend(bench.search(&model, side, &asked, setting(1, Preset::Default, &starts))?);
     }
     let pictures: Vec<(ViewReport, &Picture, Found)> =
@@ -110,15 +112,20 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
             Views { name: instance.name.clone(), dir: args.data.join(&instance.name), pictures, truths }
         });
         let unseen: Vec<Views> = unseen.collect();
-        for starts in [Starts::Neighbor4, Starts::Fixed24, Starts::Around84] {
+        for starts in STARTS {
             bench.search(&model, side, &unseen, setting(2, Preset::Default, &starts))?;
         }
-        for starts in [Starts::Neighbor4, Starts::Fixed24] {
+        for starts in STARTS.into_iter().take(2) {
             bench.search(&model, side, &few(&unseen), setting(2, Preset::Paper, &starts))?;
         }
     }
     for loss in LOSSES {
-        bench.search(&model, side, &few(&asked), Setting { loss: Some(loss), ..setting(3, Preset::Paper, &Starts::Neighbor4) })?;
+        bench.search(
+            &model,
+            side,
+            &few(&asked),
+            Setting { loss: Some(loss), ..setting(3, Preset::Paper, &Starts::Neighbor4) },
+        )?;
     }
     bench.search(&model, side, &few(&asked), setting(1, Preset::Paper, &Starts::Fixed24))?;
     eprintln!("{} in {}", FILES.join(", "), dir.display());
@@ -147,7 +154,13 @@ fn few(asked: &[Views], count: Option<u32>) -> Vec<Views> {
 
 impl Bench<'_> {
     /// Searches with a setting, and writes all files anew: hours of work are not lost with the last of them.
-    fn search(&mut self, model: &Model, side: u32, asked: &[Views], setting: Setting) -> Result<Vec<(ViewReport, Picture, Found)>> {
+    fn search(
+        &mut self,
+        model: &Model,
+        side: u32,
+        asked: &[Views],
+        setting: Setting,
+    ) -> Result<Vec<(ViewReport, Picture, Found)>> {
         let search: SearchArgs = self.args.search.with(setting.preset, setting.loss.map(|(_, loss)| loss))?;
         let steps: u64 = search.options()?.phases.iter().map(|phase| u64::from(phase.steps)).sum();
         let bar = progress(steps * asked.len() as u64, "steps");
@@ -176,7 +189,7 @@ impl Bench<'_> {
                 Ok(())
             })?;
             for ((picture, truth), found) in pictures.iter().zip(truths).zip(found) {
-                let report = view_report(name, picture, truth, &found, Axes::OpenCv, None);
+                let report = view_report(model, name, picture, truth, &found, Axes::OpenCv, None);
                 results.push((report, picture.clone(), found));
             }
         }
@@ -203,13 +216,16 @@ impl Bench<'_> {
     fn write_files(&self) -> Result<()> {
         let write = |file: &str, text: String| sigma_srn::write_atomically(&self.dir.join(file), text.as_bytes());
         write(FILES[0], self.tables())?;
-        let mut rows = "table,preset,loss,starts,instance,view,rotation_deg,translation,oracle_deg,unexplained,converged,seconds\n".to_string();
+        let mut rows =
+            "table,preset,loss,starts,instance,view,rotation_deg,translation,oracle_deg,unexplained,trusted,within_95,seconds\n"
+                .to_string();
         let mut curves = "preset,loss,starts,step,seconds,rotation_deg_mean,rotation_deg_median\n".to_string();
         for Outcome { setting, views, moments } in &self.outcomes {
             let what = format!("{},{},{}", setting.preset(), setting.loss(), setting.starts);
-            for ViewReport { instance, view, error, oracle, unexplained, converged, seconds, .. } in views {
+            for ViewReport { instance, view, error, oracle, unexplained, trusted, within_95, seconds, .. } in views {
                 let (rotation, translation, oracle) = (error.rotation_deg, error.translation, oracle.rotation_deg);
-                let numbers = format!("{rotation},{translation},{oracle},{unexplained},{converged},{seconds}");
+                let within_95 = within_95.map_or(String::new(), |within| within.to_string());
+                let numbers = format!("{rotation},{translation},{oracle},{unexplained},{trusted},{within_95},{seconds}");
                 rows += &format!("{},{what},{instance},{view},{numbers}\n", setting.table);
             }
             for moment in moments.iter().filter(|_| setting.table != 2) {
@@ -241,8 +257,10 @@ impl Bench<'_> {
             if outcomes.is_empty() {
                 continue;
             }
-            outcomes.sort_by_key(|outcome| (outcome.setting.starts.to_string().len(), outcome.setting.preset()));
-            let head = "preset,loss,starts,views,rotation mean,95 %,median,<= 5°,<= 10°,oracle mean,translation mean,95 %,median,s/view";
+            let order = |starts: &Starts| STARTS.iter().position(|known| known == starts);
+            outcomes.sort_by_key(|outcome| (order(&outcome.setting.starts), outcome.setting.preset()));
+            let head =
+                "preset,loss,starts,views,rotation mean,95 %,median,<= 5°,<= 10°,oracle mean,translation mean,95 %,median,s/view";
             let mut rows: Vec<Vec<String>> = vec![head.split(',').map(String::from).collect()];
             for Outcome { setting, views, .. } in outcomes {
                 let s = Summary::of("", &views.iter().collect::<Vec<_>>());

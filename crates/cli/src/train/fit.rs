@@ -80,7 +80,7 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     let mut model = Model::init(&settings.model(), settings.seed)?;
     let instance_names = set.instances.iter().map(|instance| instance.name.clone()).collect();
     let orbit_radius = median_distance(&set);
-    model.metadata = Metadata { instance_names, side: Some(settings.side), orbit_radius: Some(orbit_radius) };
+    model.metadata = Metadata { instance_names, side: Some(settings.side), orbit_radius: Some(orbit_radius), calibration: None };
     let mut trainer = Trainer::new(&engine, model, Train::Everything, settings.batch, settings.rays)?;
     let checkpoint = run.join("checkpoint.safetensors");
     // A run that was killed before its first checkpoint begins again.
