@@ -180,6 +180,52 @@ fn a_calibrated_model_states_deviations() {
     assert!(run(dir, evaluate, 0).contains("ellipsoid of 1 of 1"));
 }
 
+/// A line per frame; what is lost is searched for again; an animation is written once.
+#[test]
+fn frames_are_followed() {
+    let home = home();
+    let dir = home.path();
+    let frames = "track DATA/chicken/rgb --model model.safetensors --executor cpu --steps 2 --truth auto";
+    let lines = run(dir, &format!("{frames} --rough auto --accept 1e9 --record frames.gif --json"), 0);
+    let lines: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(lines.len(), 20);
+    assert!(lines.iter().all(|line| line["searched"] == false && line["trusted"] == true && line["error"].is_object()));
+    assert!(lines[3]["frame"].as_str().unwrap().ends_with("000003.png"));
+    let animation = std::io::BufReader::new(fs::File::open(dir.join("frames.gif")).unwrap());
+    let animation = image::AnimationDecoder::into_frames(image::codecs::gif::GifDecoder::new(animation).unwrap());
+    assert_eq!(animation.count(), 20);
+    fail(dir, &format!("{frames} --record frames.gif"), &["frames.gif", "--force"]);
+    fail(dir, "track . --model model.safetensors --instance seat --fov 50", &["no pictures"]);
+
+    // Nothing is good enough: every frame is searched for all around.
+    let two = format!("track DATA/{CHICKEN} DATA/chicken/rgb/000004.png --model model.safetensors --executor cpu --steps 2");
+    let lines = run(dir, &format!("{two} --accept 1e-9"), 1);
+    assert_eq!((lines.matches("searched all around").count(), lines.matches("DO NOT TRUST").count()), (2, 2), "{lines}");
+}
+
+/// The tables of one instance: every preset and loss, all files, nothing overwritten.
+#[test]
+fn tables_hold_every_preset() {
+    let home = home();
+    let dir = home.path();
+    let args = "evaluate --model model.safetensors --data DATA --heldout DATA --instances 1 --views 1 --paper-views 1 --executor cpu";
+    run(dir, &format!("{args} --tables tables"), 0);
+    assert_eq!(files(&dir.join("tables")), ["convergence.csv", "convergence.png", "tables.md", "views.csv", "worst.png"]);
+    let tables = fs::read_to_string(dir.join("tables/tables.md")).unwrap();
+    let rows = |from: &str, to: &str| {
+        let part = tables.split(from).nth(1).unwrap().split(to).next().unwrap();
+        part.lines().filter(|line| line.starts_with('|')).count() - 2
+    };
+    assert_eq!([rows("Table 1", "Table 2"), rows("Table 2", "Table 3"), rows("Table 3", "Table 4")], [5, 6, 6], "{tables}");
+    let views = fs::read_to_string(dir.join("tables/views.csv")).unwrap();
+    assert_eq!(views.lines().count(), 1 + 3 + 3 + 1 + 2 + 5 + 1);
+    let steps = fs::read_to_string(dir.join("tables/convergence.csv")).unwrap();
+    assert!(steps.lines().any(|line| line.starts_with("paper,mae,fixed24,300,")), "{steps}");
+    fail(dir, &format!("{args} --tables tables"), &["tables.md", "--force"]);
+    fail(dir, &format!("{args} --tables other --preset paper"), &["--tables", "--radius"]);
+    fail(dir, &format!("{args} --starts fixed24 --tables other"), &["--starts", "--tables"]);
+}
+
 /// One line per image; pictures where they were asked for; nothing overwritten.
 #[test]
 fn records_are_written_once() {

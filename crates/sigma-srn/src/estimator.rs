@@ -58,21 +58,38 @@ pub struct Options {
     pub seed: u64,
 }
 
+/// How hard a search tries.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Effort {
+    /// For poses that are roughly known, and objects that look different from every side.
+    Fast,
+    /// What the figures are measured with.
+    #[default]
+    Normal,
+    /// For what `Normal` has lost.
+    Exhaustive,
+}
+
 impl Default for Options {
-    /// BFGS: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the best three on
-    /// all, until they stand still: the loss has minima side by side.
     fn default() -> Self {
-        let phases = vec![
-            Phase { steps: 0, stride: 4, keep: usize::MAX },
-            Phase { steps: 8, stride: 4, keep: 16 },
-            Phase { steps: 8, stride: 2, keep: 6 },
-            Phase { steps: 14, stride: 1, keep: 3 },
-        ];
-        Options { method: Method::Bfgs { soft: 0.3 }, min_starts: 84, phases, seed: 0 }
+        Options::of(Effort::Normal)
     }
 }
 
 impl Options {
+    /// BFGS: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the best few on
+    /// all, until they stand still: the loss has minima side by side.
+    pub fn of(effort: Effort) -> Self {
+        let (min_starts, descents) = match effort {
+            Effort::Fast => (84, [(6, 6), (6, 2), (8, 1)]),
+            Effort::Normal => (84, [(8, 16), (8, 6), (14, 3)]),
+            Effort::Exhaustive => (168, [(10, 64), (10, 20), (16, 6)]),
+        };
+        let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX }];
+        phases.extend([4, 2, 1].into_iter().zip(descents).map(|(stride, (steps, keep))| Phase { steps, stride, keep }));
+        Options { method: Method::Bfgs { soft: 0.3 }, min_starts, phases, seed: 0 }
+    }
+
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
     pub fn paper() -> Self {
         let method = Method::Adam { loss: Loss::Mae, learning_rate: 0.1 };

@@ -19,19 +19,21 @@ mod rays;
 mod renderer;
 mod torch;
 mod trainer;
+mod unseen;
 
 pub use camera::{Intrinsics, Pose6};
 pub use confidence::Calibration;
 pub use descent::{Descent, Loss, Method, Shape};
 pub use engine::Engine;
 pub use error::Error;
-pub use estimator::{Estimate, Options, Phase, Progress, Query, Ranked, estimate};
+pub use estimator::{Effort, Estimate, Options, Phase, Progress, Query, Ranked, estimate};
 pub use model::{Block, Hypernetwork, Kind, Layout, Metadata, Model, ModelConfig, Parameter, Source, write_atomically};
 pub use random::{Random, stream};
 pub use rays::{Rays, pixel_grid};
 pub use renderer::{Renderer, Rendering};
 pub use srn_gpu::{AdapterInfo, Gpu, adapters, wgpu};
 pub use trainer::{Losses, Train, Trainer, TrainingBatch};
+pub use unseen::{Unseen, estimate_unseen};
 
 /// The README's code, compiled and run as a documentation test.
 #[cfg(doctest)]

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use sigma_cli::common::finish;
-use sigma_cli::pose::{bake, calibrate, estimate, evaluate, render};
+use sigma_cli::pose::{bake, calibrate, estimate, evaluate, render, track};
 
 /// Camera poses of pictures by gradient descent through a neural renderer.
 ///
@@ -20,6 +20,8 @@ struct Cli {
 enum Command {
     /// Find the poses of pictures. Exit status 1 if one of them is not to be trusted; see --accept.
     Estimate(estimate::Estimate),
+    /// Follow an object from frame to frame. Exit status 1 if the last pose is not to be trusted.
+    Track(track::Track),
     /// Measure the errors on a data set, by the paper's protocol.
     Evaluate(evaluate::Evaluate),
     /// Compare estimates with known poses, so that others come with standard deviations and a verdict.
@@ -33,6 +35,7 @@ enum Command {
 fn main() -> ExitCode {
     finish(match Cli::parse().command {
         Command::Estimate(args) => estimate::run(&args),
+        Command::Track(args) => track::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Render(args) => render::run(&args),

@@ -13,6 +13,7 @@ pub mod render;
 mod search;
 mod summary;
 mod tables;
+pub mod track;
 mod views;
 
 /// A finite number above zero.

@@ -10,8 +10,8 @@ use serde::Serialize;
 use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
 use sigma_srn::confidence::deviations;
 use sigma_srn::{
-    Calibration, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer, Rendering,
-    estimate,
+    Calibration, Effort, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer, Rendering, Unseen,
+    estimate, estimate_unseen,
 };
 
 use super::files::Picture;
@@ -32,6 +32,9 @@ pub struct SearchArgs {
     /// steps of Adam on the camera's six numbers for every start, on all pixels; the last step counts.
     #[arg(long, value_enum, default_value_t = Preset::Default)]
     preset: Preset,
+    /// How hard the default preset tries: for poses that are roughly known, in general, for what that has lost.
+    #[arg(long, value_enum, default_value_t = HowHard::Normal)]
+    effort: HowHard,
     /// How `--preset paper` compares picture and render. Default: mae. `gmsd` implies `--stride 1`.
     #[arg(long, value_parser = PossibleValuesParser::new(LOSSES.map(|(name, _)| name)).map(loss))]
     loss: Option<Loss>,
@@ -70,6 +73,24 @@ pub struct SearchArgs {
 pub enum Preset {
     Default,
     Paper,
+}
+
+/// [`Effort`] as a flag.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum HowHard {
+    Fast,
+    Normal,
+    Exhaustive,
+}
+
+impl From<HowHard> for Effort {
+    fn from(effort: HowHard) -> Self {
+        match effort {
+            HowHard::Fast => Effort::Fast,
+            HowHard::Normal => Effort::Normal,
+            HowHard::Exhaustive => Effort::Exhaustive,
+        }
+    }
 }
 
 /// The paper's losses, and two that the authors' code adds.
@@ -119,7 +140,7 @@ impl SearchArgs {
     /// The same radius, seed and limit of acceptance, with the settings of a preset; an error if other flags were given.
     pub fn with(&self, preset: Preset, loss: Option<Loss>) -> Result<Self> {
         let is_plain = self.preset == Preset::Default && self.loss.is_none() && self.lr.is_none() && self.steps.is_none();
-        if !is_plain || self.cull || self.no_cull || self.stride.is_some() {
+        if !is_plain || self.effort != HowHard::Normal || self.cull || self.no_cull || self.stride.is_some() {
             return Err(
                 "--tables compares the presets as they are: of the flags of the search it takes --radius, --seed and --accept"
                     .into(),
@@ -131,8 +152,9 @@ impl SearchArgs {
     /// The settings of the estimator.
     pub fn options(&self) -> Result<Options> {
         let mut options = match self.preset {
-            Preset::Default => Options::default(),
-            Preset::Paper => Options::paper(),
+            Preset::Default => Options::of(self.effort.into()),
+            Preset::Paper if self.effort == HowHard::Normal => Options::paper(),
+            Preset::Paper => return Err("--effort is for the default preset: the paper's has one".into()),
         };
         match (&mut options.method, self.loss, self.lr) {
             (Method::Adam { loss, learning_rate }, wanted_loss, wanted_rate) => {
@@ -166,31 +188,57 @@ impl SearchArgs {
         starts: &[Vec<DMat4>],
         observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
     ) -> Result<Vec<Found>> {
-        let query = |(picture, starts): (&Picture, &Vec<DMat4>)| Query {
-            instance: picture.instance,
-            rgb: picture.rgb.clone(),
-            weights: picture.weights.clone(),
-            width: side,
-            height: side,
-            intrinsics: picture.intrinsics,
-            starts: starts.clone(),
-        };
-        let queries: Vec<_> = pictures.iter().zip(starts).map(query).collect();
+        self.run_with(&self.options()?, engine, model, side, pictures, starts, observe)
+    }
+
+    /// The same with other settings of the estimator.
+    #[allow(clippy::too_many_arguments)] // those of `run`, and one more
+    pub fn run_with(
+        &self,
+        options: &Options,
+        engine: &Engine,
+        model: &Model,
+        side: u32,
+        pictures: &[Picture],
+        starts: &[Vec<DMat4>],
+        observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
+    ) -> Result<Vec<Found>> {
+        let queries: Vec<_> = pictures.iter().zip(starts).map(|(picture, starts)| query(picture, side, starts)).collect();
         let began = Instant::now();
-        let estimates = estimate(engine, model, &queries, &self.options()?, observe)?;
+        let estimates = estimate(engine, model, &queries, options, observe)?;
         let seconds = began.elapsed().as_secs_f64() / pictures.len() as f64;
 
         let view = |(picture, found): (&Picture, &Estimate)| (picture.instance, found.pose.to_matrix(), picture.intrinsics);
         let views: Vec<View> = pictures.iter().zip(&estimates).map(view).collect();
         let renders = render(engine, model, side, &views)?;
-        let found = estimates.into_iter().zip(renders).zip(pictures).map(|((estimate, render), picture)| {
-            let unexplained = unexplained(picture, &render.rgb);
-            let trusted = self.trusts(model, &estimate, unexplained);
-            let confidence = model.metadata.calibration.as_ref().and_then(|calibration| Confidence::of(&estimate, calibration));
-            let world_from_camera = estimate.pose.to_matrix();
-            Found { world_from_camera, estimate, rgb: render.rgb, unexplained, trusted, confidence, seconds }
-        });
-        Ok(found.collect())
+        let found = estimates.into_iter().zip(renders).zip(pictures);
+        Ok(found.map(|((estimate, render), picture)| self.found(model, picture, estimate, render, seconds)).collect())
+    }
+
+    /// Estimates the pose of an object that the model was not trained on. The model with the object is returned too.
+    pub fn run_unseen(
+        &self,
+        engine: &Engine,
+        model: &Model,
+        side: u32,
+        picture: &Picture,
+        starts: &[DMat4],
+        observe: impl FnMut(usize, usize) -> std::result::Result<(), Error>,
+    ) -> Result<(Found, Model)> {
+        let began = Instant::now();
+        let Unseen { estimate, model, .. } = estimate_unseen(engine, model, &query(picture, side, starts), self.seed, observe)?;
+        let seconds = began.elapsed().as_secs_f64();
+        let view = (0, estimate.pose.to_matrix(), picture.intrinsics);
+        let render = render(engine, &model, side, &[view])?.swap_remove(0);
+        Ok((self.found(&model, picture, estimate, render, seconds), model))
+    }
+
+    fn found(&self, model: &Model, picture: &Picture, estimate: Estimate, render: Rendering, seconds: f64) -> Found {
+        let unexplained = unexplained(picture, &render.rgb);
+        let trusted = self.trusts(model, &estimate, unexplained);
+        let confidence = model.metadata.calibration.as_ref().and_then(|calibration| Confidence::of(&estimate, calibration));
+        let world_from_camera = estimate.pose.to_matrix();
+        Found { world_from_camera, estimate, rgb: render.rgb, unexplained, trusted, confidence, seconds }
     }
 
     /// Whether an estimate is to be trusted.
@@ -236,6 +284,18 @@ impl SearchArgs {
             }
             Starts::File(path) => Ok(srn_data::srn::read_poses(path)?.into_iter().map(|pose| notation.ours(pose)).collect()),
         }
+    }
+}
+
+fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
+    Query {
+        instance: picture.instance,
+        rgb: picture.rgb.clone(),
+        weights: picture.weights.clone(),
+        width: side,
+        height: side,
+        intrinsics: picture.intrinsics,
+        starts: starts.to_vec(),
     }
 }
 

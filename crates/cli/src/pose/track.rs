@@ -1,0 +1,210 @@
+//! `sigma-pose track`: an object's pose from frame to frame.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use glam::DMat4;
+use serde::Serialize;
+use sigma_srn::{Options, Phase, Pose6};
+
+use super::draw;
+use super::files::{CameraArgs, Picture, PoseSource, mask_of, model_side, write_gif};
+use super::notation::NotationArgs;
+use super::search::{Confidence, Found, PoseError, SearchArgs, Starts};
+use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
+
+/// Side of a frame in the animation, pixels.
+const SHOWN: u32 = 192;
+/// Seconds that it stays.
+const STAY: f64 = 0.1;
+
+/// Flags of `sigma-pose track`.
+#[derive(Args, Debug)]
+pub struct Track {
+    /// Frames in order, as `estimate` takes them; or a folder, whose pictures are taken by name.
+    #[arg(required = true, value_name = "FRAME|DIR")]
+    frames: Vec<PathBuf>,
+    /// Model, or checkpoint of a training run.
+    #[arg(long, value_name = "FILE")]
+    model: PathBuf,
+    /// Name or number of the object. Default: the name of the SRN folder that a frame lies in.
+    #[arg(long, value_name = "NAME")]
+    instance: Option<String>,
+    #[command(flatten)]
+    camera: CameraArgs,
+    /// Folder with masks called like the frames; see `estimate`.
+    #[arg(long, value_name = "DIR")]
+    mask: Option<PathBuf>,
+    /// Pose in the first frame. Default: searched for all around.
+    #[arg(long, value_name = "POSE")]
+    rough: Option<PoseSource>,
+    /// True pose of every frame, to report errors; `auto`: the one in the frame's SRN folder.
+    #[arg(long, value_name = "auto")]
+    truth: Option<PoseSource>,
+    /// Print a line of JSON per frame.
+    #[arg(long)]
+    json: bool,
+    /// Write an animation: each frame beside the view from its pose.
+    #[arg(long, value_name = "GIF")]
+    record: Option<PathBuf>,
+    /// Overwrite the file of --record.
+    #[arg(long)]
+    force: bool,
+    #[command(flatten)]
+    engine: EngineArgs,
+    #[command(flatten)]
+    poses: NotationArgs,
+    // Last, for its heading holds for all flags that follow.
+    #[command(flatten)]
+    search: SearchArgs,
+}
+
+/// A line of `--json`.
+#[derive(Serialize)]
+struct FrameReport<'a> {
+    frame: &'a Path,
+    /// Rows of the 4×4 matrix, as the flags for poses want it.
+    world_from_camera: [[f64; 4]; 4],
+    loss: f64,
+    unexplained: f64,
+    trusted: bool,
+    confidence: Option<Confidence>,
+    /// The pose is not from that of the frame before, but was searched for all around.
+    searched: bool,
+    error: Option<PoseError>,
+    seconds: f64,
+}
+
+/// Runs the command; false where the last pose is not to be trusted.
+pub fn run(args: &Track) -> Result<bool> {
+    let model = load_model(&args.model)?;
+    let frames = frames(&args.frames)?;
+    let side = model_side(&model, &frames[0])?;
+    let notation = args.poses.open()?;
+    if let Some(path) = &args.record {
+        refuse_existing([path.clone()], args.force)?;
+    }
+    let engine = args.engine.open()?;
+    let all_around = args.search.options()?;
+    // The next pose is near; what would have to be found from afar is searched for all around instead.
+    let phase = |steps, stride, keep| Phase { steps, stride, keep };
+    let phases = vec![phase(5, 2, 2), phase(3, 1, 1)];
+    let from_frame_to_frame = Options { phases, min_starts: 0, ..all_around.clone() };
+
+    let mut animation = Vec::new();
+    // The last two poses, the later one first.
+    let mut before: Vec<DMat4> = Vec::new();
+    let (mut errors, mut searches, mut trusted) = (Vec::new(), 0, true);
+    for (number, path) in frames.iter().enumerate() {
+        let mask = args.mask.as_ref().map(|mask| mask_of(mask, path)).transpose()?;
+        let picture = Picture::open(path, mask.as_deref(), &model, side, args.instance.as_deref(), &args.camera)?;
+        if let (0, Some(rough)) = (number, &args.rough) {
+            before = vec![rough.read(path, &notation)?];
+        }
+        let run = |options: &Options, starts: Vec<DMat4>| -> Result<Found> {
+            let found = args.search.run_with(options, &engine, &model, side, std::slice::from_ref(&picture), &[starts], |_| Ok(()));
+            Ok(found?.swap_remove(0))
+        };
+        let followed = match before[..] {
+            [] => None,
+            [last] => Some(run(&from_frame_to_frame, vec![last])?),
+            // It stands still, or goes on as it did.
+            [last, earlier, ..] => Some(run(&from_frame_to_frame, vec![last, last * earlier.inverse() * last])?),
+        };
+        let searched = followed.as_ref().is_none_or(|found| !found.trusted);
+        let found = match followed.filter(|found| found.trusted) {
+            Some(found) => found,
+            None => {
+                let starts = args.search.starts(&Starts::Around84, &model, &picture, side, None, &notation)?;
+                run(&all_around, starts)?
+            }
+        };
+        trusted = found.trusted;
+        before.truncate(if searched { 0 } else { 1 });
+        // What is not to be trusted is no place to go on from.
+        if trusted {
+            before.insert(0, found.world_from_camera);
+        }
+        let truth = args.truth.as_ref().map(|truth| truth.read(path, &notation)).transpose()?;
+        let error = truth.map(|truth| PoseError::of(&found.world_from_camera, &truth));
+        errors.extend(error);
+        searches += usize::from(searched);
+        if args.record.is_some() {
+            animation.push(side_by_side(&picture, &found, side));
+        }
+        let written = notation.written(&found.world_from_camera);
+        let report = FrameReport {
+            frame: path,
+            world_from_camera: written.transpose().to_cols_array_2d(),
+            loss: found.estimate.loss,
+            unexplained: found.unexplained,
+            trusted,
+            confidence: found.confidence,
+            searched,
+            error,
+            seconds: found.seconds,
+        };
+        print(&if args.json { serde_json::to_string(&report)? } else { report.line(&Pose6::from_matrix(&written)) })?;
+    }
+    if let Some(path) = &args.record {
+        write_gif(path, animation.into_iter().map(|frame| (frame, STAY)))?;
+        eprintln!("{}", path.display());
+    }
+    if !errors.is_empty() {
+        let mean = |of: fn(&PoseError) -> f64| errors.iter().map(of).sum::<f64>() / errors.len() as f64;
+        let (turn, shift) = (mean(|error| error.rotation_deg), mean(|error| error.translation));
+        let worst = errors.iter().map(|error| error.rotation_deg).fold(0.0, f64::max);
+        eprintln!("{} frames, {searches} searched all around; error {turn:.2}° {shift:.3} in the mean, {worst:.2}° at worst", frames.len());
+    }
+    Ok(trusted)
+}
+
+/// The pictures in a folder by name, or the frames as they were given.
+fn frames(given: &[PathBuf]) -> Result<Vec<PathBuf>> {
+    let [dir] = given else { return Ok(given.to_vec()) };
+    if !dir.is_dir() {
+        return Ok(given.to_vec());
+    }
+    let files = std::fs::read_dir(dir).map_err(|error| format!("{}: {error}", dir.display()))?;
+    let mut frames = files.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
+    let is_picture = |path: &PathBuf| {
+        let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        ["png", "jpg", "jpeg"].contains(&ending.as_str())
+    };
+    frames.retain(is_picture);
+    frames.sort();
+    if frames.is_empty() {
+        return Err(format!("{}: no pictures (.png, .jpg) in it", dir.display()).into());
+    }
+    Ok(frames)
+}
+
+fn side_by_side(picture: &Picture, found: &Found, side: u32) -> image::RgbImage {
+    let views = [
+        draw::view(&picture.rgb, side, SHOWN),
+        draw::view(&found.rgb, side, SHOWN),
+        draw::difference(&picture.rgb, &found.rgb, side, SHOWN),
+    ];
+    let mut row = image::RgbImage::new(3 * views[0].width(), views[0].height());
+    for (view, k) in views.iter().zip(0i64..) {
+        image::imageops::replace(&mut row, view, k * i64::from(view.width()), 0);
+    }
+    row
+}
+
+impl FrameReport<'_> {
+    fn line(&self, pose: &Pose6) -> String {
+        let [a, b, c, x, y, z] = pose.0;
+        let [a, b, c] = [a, b, c].map(f64::to_degrees);
+        let deviation = self.confidence.map_or(String::new(), |c| format!("  ± {:.2}° {:.4}", c.rotation_deg, c.translation));
+        let error = self.error.map_or(String::new(), |error| format!("  error {error}"));
+        let searched = if self.searched { "  searched all around" } else { "" };
+        let verdict = if self.trusted { "" } else { "  DO NOT TRUST" };
+        format!(
+            "{}  rotation {a:.2}° {b:.2}° {c:.2}°  centre {x:.4} {y:.4} {z:.4}{deviation}  unexplained {:.0} %  {:.2} s{error}{searched}{verdict}",
+            self.frame.display(),
+            100.0 * self.unexplained,
+            self.seconds
+        )
+    }
+}
