@@ -29,6 +29,13 @@ pub struct Estimate {
     /// Name or number of the object in the pictures. Default: the name of the SRN folder that a picture lies in.
     #[arg(long, value_name = "NAME")]
     instance: Option<String>,
+    /// The object is none of the model's, but of their kind: a latent code is fitted to each picture together with the pose, beginning with
+    /// those of the objects that look most alike.
+    #[arg(long, conflicts_with_all = ["instance", "record"])]
+    unseen: bool,
+    /// With --unseen and one picture: write the model with this object, for further pictures of it.
+    #[arg(long, value_name = "FILE", requires = "unseen")]
+    save_model: Option<PathBuf>,
     #[command(flatten)]
     camera: CameraArgs,
     /// What counts in a picture: white, or opaque. What is black (something before the object, a cluttered background) has no part in the
@@ -141,7 +148,16 @@ pub fn run(args: &Estimate) -> Result<bool> {
         create_dir(dir)?;
     }
     let options = args.search.options()?;
+    if let Some(path) = &args.save_model {
+        if pictures.len() > 1 {
+            return Err("--save-model is for one picture".into());
+        }
+        refuse_existing([path.clone()], args.force)?;
+    }
     let engine = args.engine.open()?;
+    if args.unseen {
+        return unseen(args, &engine, &model, side, &pictures, &starts, &sources, &notation);
+    }
 
     let bar = progress(options.phases.iter().map(|phase| u64::from(phase.steps)).sum(), "steps");
     let mut log = Log::default();
@@ -151,13 +167,8 @@ pub fn run(args: &Estimate) -> Result<bool> {
     })?;
     bar.finish_and_clear();
 
-    let report = report(args, &engine, &model, &pictures, &found, &sources);
-    if args.json {
-        print(&serde_json::to_string_pretty(&report)?)?;
-    } else {
-        let poses = found.iter().map(|found| Pose6::from_matrix(&notation.written(&found.world_from_camera)));
-        report.images.iter().zip(poses).try_for_each(|(image, pose)| print(&image.line(&pose)))?;
-    }
+    let names = pictures.iter().map(|picture| model.instance_name(picture.instance)).collect();
+    report(args, &engine, names, &pictures, &found, &sources).print(args, &found, &notation)?;
     if let Some(dir) = &args.record {
         for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
             log.write(dir, i, picture, found, &engine, &model, side)?;
@@ -165,6 +176,38 @@ pub fn run(args: &Estimate) -> Result<bool> {
         }
         eprintln!("pictures in {}", dir.display());
     }
+    Ok(found.iter().all(|found| found.trusted))
+}
+
+/// Poses of objects that are not in the model.
+#[allow(clippy::too_many_arguments)] // what `run` has read
+fn unseen(
+    args: &Estimate,
+    engine: &Engine,
+    model: &Model,
+    side: u32,
+    pictures: &[Picture],
+    starts: &[Vec<DMat4>],
+    sources: &[Option<Notation>],
+    notation: &Notation,
+) -> Result<bool> {
+    let mut found = Vec::new();
+    let bar = progress(0, "turns");
+    for (number, (picture, starts)) in pictures.iter().zip(starts).enumerate() {
+        let observe = |turn: usize, turns: usize| {
+            bar.set_length((turns * pictures.len()) as u64);
+            bar.set_position((turns * number + turn) as u64);
+            Ok(())
+        };
+        let (one, fitted) = args.search.run_unseen(engine, model, side, picture, starts, observe)?;
+        if let Some(path) = &args.save_model {
+            fitted.save(path)?;
+        }
+        found.push(one);
+    }
+    bar.finish_and_clear();
+    let names = vec!["unseen".to_string(); pictures.len()];
+    report(args, engine, names, pictures, &found, sources).print(args, &found, notation)?;
     Ok(found.iter().all(|found| found.trusted))
 }
 
@@ -188,7 +231,8 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
     let mut pictures = Vec::new();
     for ((path, mask), truth) in masks.into_iter().zip(truths) {
         let mask = mask.map(|mask| mask_of(mask, path)).transpose()?;
-        let picture = Picture::open(path, mask.as_deref(), model, side, args.instance.as_deref(), &args.camera)?;
+        let instance = if args.unseen { Some("0") } else { args.instance.as_deref() };
+        let picture = Picture::open(path, mask.as_deref(), model, side, instance, &args.camera)?;
         let mut picture = Picture { truth, ..picture };
         while !names.insert(picture.name.clone()) {
             picture.name += "-again";
@@ -201,13 +245,13 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
 fn report(
     args: &Estimate,
     engine: &Engine,
-    model: &Model,
+    names: Vec<String>,
     pictures: &[Picture],
     found: &[Found],
     sources: &[Option<Notation>],
 ) -> Report {
     let convention = args.poses.convention;
-    let image = |(((image, picture), found), source): (((&PathBuf, &Picture), &Found), &Option<Notation>)| {
+    let image = |((((image, picture), instance), found), source): ((((&PathBuf, &Picture), String), &Found), &Option<Notation>)| {
         let world_from_camera = convention.of_ours(found.world_from_camera);
         let [a, b, c, x, y, z] = Pose6::from_matrix(&world_from_camera).0;
         let error = |pose: &DMat4| picture.truth.map(|truth| PoseError::of(pose, &truth));
@@ -224,7 +268,7 @@ fn report(
         };
         ImageReport {
             image: image.clone(),
-            instance: model.instance_name(picture.instance),
+            instance,
             world_from_camera: world_from_camera.transpose().to_cols_array_2d(),
             source_from_camera: source.map(|source| source.rows(&found.world_from_camera)),
             euler_rad: [a, b, c],
@@ -244,7 +288,17 @@ fn report(
         executor: engine.to_string(),
         seconds: found.iter().map(|found| found.seconds).sum(),
         convention,
-        images: args.images.iter().zip(pictures).zip(found).zip(sources).map(image).collect(),
+        images: args.images.iter().zip(pictures).zip(names).zip(found).zip(sources).map(image).collect(),
+    }
+}
+
+impl Report {
+    fn print(&self, args: &Estimate, found: &[Found], notation: &Notation) -> Result<()> {
+        if args.json {
+            return print(&serde_json::to_string_pretty(self)?);
+        }
+        let poses = found.iter().map(|found| Pose6::from_matrix(&notation.written(&found.world_from_camera)));
+        self.images.iter().zip(poses).try_for_each(|(image, pose)| print(&image.line(&pose)))
     }
 }
 
