@@ -10,7 +10,6 @@ for the density-weighted sum, as the authors' code does; "kept" reuses those of 
 """
 
 import argparse
-import itertools
 import json
 import math
 import platform
@@ -52,7 +51,7 @@ class Net(nn.Module):
 
 def mlp(*sizes):
     """Linear, layer normalisation and ReLU from size to size; the last layer is linear alone."""
-    hidden = [Net(nn.Linear(i, o), nn.LayerNorm(o), nn.ReLU(inplace=True)) for i, o in itertools.pairwise(sizes[:-1])]
+    hidden = [Net(nn.Linear(i, o), nn.LayerNorm(o), nn.ReLU(inplace=True)) for i, o in zip(sizes, sizes[1:-1])]
     return Net(*hidden, nn.Linear(*sizes[-2:]))
 
 
@@ -177,39 +176,37 @@ def read_safetensors(path):
 def golden_differences(tensors, metadata, device, keep):
     """The worst difference of each quantity, relative to the largest expected value of its tensor."""
     tensors = {name: tensor.to(device) for name, tensor in tensors.items()}
-    intrinsics, cameras = tensors["in.intrinsics"].unsqueeze(3), tensors["in.cam2world"][:, :3]
+    # The matrices of the file, in.cam2world, were rounded after the golden values were computed.
+    intrinsics, cameras = tensors["in.intrinsics"].unsqueeze(3), pose_matrix(tensors["in.pose6"])
     lifted = lift(tensors["in.uv"], intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, 0, 2], intrinsics[:, 1, 2])
     batch = Batch(tensors["in.instance_idx"].long(), lifted, tensors["in.initial_depth"], tensors["in.target_rgb"])
     sizes = [int(metadata[name]) for name in ["hidden", "latent", "instances", "tracing_steps"]]
     model = Model(*sizes, density=metadata["density"] == "True").to(device)
-    model.load_state_dict({name[6:]: tensor for name, tensor in tensors.items() if name.startswith("model.")})
+    model.load_state_dict({name.removeprefix("model."): tensors[name] for name in tensors if name.startswith("model.")})
     worst = {}
 
-    def compare(quantity, actual, name, steps=None):
-        expected = tensors[name][:steps]
+    def compare(quantity, actual, expected):
         difference = (actual - expected).abs().max() / expected.abs().max().clamp(min=1e-30)
-        # A NaN passes through torch.maximum, and fails later.
+        # Unlike Python's max, this lets a NaN through, which then fails.
         worst[quantity] = torch.maximum(worst.get(quantity, difference), difference)
 
     arguments = frozen(model, batch, tensors["in.pose6"])
     rgb, depth = model(arguments[1], cameras, batch, keep)
-    compare("rgb", rgb, "out.rgb")
-    compare("depth", depth, "out.depth")
-    compare("pose loss", pose_step(*arguments, batch, keep), "pose.mae.loss")
-    compare("pose gradient", arguments[2].grad, "pose.mae.grad")
+    compare("rgb", rgb, tensors["out.rgb"])
+    compare("depth", depth, tensors["out.depth"])
+    compare("pose loss", pose_step(*arguments, batch, keep), tensors["pose.mae.loss"])
+    compare("pose gradient", arguments[2].grad, tensors["pose.mae.grad"])
     arguments = frozen(model, batch, tensors["refine.lr0.01.start"])
-    steps = [(pose_step(*arguments, batch, keep), arguments[2].detach().clone()) for _ in range(2)]
-    # Later steps part ways in float32: the absolute error has kinks.
-    compare("refinement", torch.stack([loss for loss, _ in steps]), "refine.lr0.01.losses", 2)
-    compare("refinement", torch.stack([pose for _, pose in steps]), "refine.lr0.01.poses", 2)
+    # Two steps, here and below: after more, kinks lead two float32 programs apart.
+    for losses, poses in zip(tensors["refine.lr0.01.losses"][:2], tensors["refine.lr0.01.poses"]):
+        compare("refinement losses", pose_step(*arguments, batch, keep), losses)
+        compare("refinement poses", arguments[2].detach(), poses)
 
-    model.requires_grad_(True)
-    adam, losses = torch.optim.Adam(model.parameters(), 5e-5), []
-    for step in range(len(tensors["train.losses"])):
-        losses.append(training_step(model, cameras, adam, batch, keep))
+    adam = torch.optim.Adam(model.requires_grad_(True).parameters(), 5e-5)
+    for step, loss in enumerate(tensors["train.losses"][:2]):
+        compare("training losses", training_step(model, cameras, adam, batch, keep), loss)
         for name, parameter in model.named_parameters() if step == 0 else []:
-            compare("parameter gradients", parameter.grad, "grad." + name)
-    compare("training losses", torch.stack(losses), "train.losses")
+            compare("parameter gradients", parameter.grad, tensors["grad." + name])
     return {quantity: difference.item() for quantity, difference in worst.items()}
 
 
@@ -219,7 +216,7 @@ def check(files, device):
         try:
             tensors, metadata = read_safetensors(path)
             rows = {version: golden_differences(tensors, metadata, device, keep) for version, keep in VERSIONS.items()}
-        except (OSError, KeyError, ValueError, RuntimeError) as error:
+        except (OSError, AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             refuse(f"{path} cannot be checked: {type(error).__name__}: {error}")
         for version, row in rows.items():
             figures = [f"{name} {value:.1e}{'' if value <= TOLERANCE else ' FAILED'}" for name, value in row.items()]
@@ -229,17 +226,16 @@ def check(files, device):
 
 
 def median_seconds(work, runs, device):
-    """Median of several runs after one that is not counted, three on a GPU, whose libraries choose kernels and memory first."""
-    synchronise = torch.cuda.synchronize if device.type == "cuda" else lambda: None
-    seconds = []
-    for run in range(-3 if device.type == "cuda" else -1, runs):
-        synchronise()
+    """Median of several runs, after one (three on a GPU) that pays for the first use of kernels and memory."""
+    on_gpu, seconds = device.type == "cuda", []
+    warm_up = 3 if on_gpu else 1
+    for _ in range(warm_up + runs):
         begin = time.perf_counter()
         work()
-        synchronise()
-        if run >= 0:
-            seconds.append(time.perf_counter() - begin)
-    return statistics.median(seconds)
+        if on_gpu:
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - begin)
+    return round(statistics.median(seconds[warm_up:]), 6)
 
 
 def any_batch(images, device):
@@ -287,11 +283,6 @@ def measure(arguments, device):
     return 0
 
 
-class Parser(argparse.ArgumentParser):
-    def error(self, message):
-        refuse(f"{message} (see {self.prog} --help)")
-
-
 def count(text):
     if not text.isdecimal() or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text} is not a whole number above 0")
@@ -299,7 +290,7 @@ def count(text):
 
 
 def main():
-    parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     checking = commands.add_parser("check", help="compare with golden files")
     checking.add_argument("files", nargs="+", metavar="FILE")
@@ -311,6 +302,8 @@ def main():
     timing.add_argument("--json", action="store_true")
     for command in [checking, timing]:
         command.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    for each in [parser, checking, timing]:
+        each.error = refuse
     arguments = parser.parse_args()
     if arguments.device == "cuda" and not torch.cuda.is_available():
         refuse("--device cuda: this PyTorch finds no CUDA device")

@@ -10,8 +10,8 @@ const MODEL: &str = "assets/models/compact.safetensors";
 const VIEWS: &str = "assets/dataset/test";
 /// Where the pictures go.
 const OUT: &str = "demo";
-/// Pictures whose pose is looked for with no idea of it.
-const LOST: [&str; 3] = ["forklift/rgb/000006", "chicken/rgb/000011", "steering/rgb/000003"];
+/// A picture whose search is drawn, step by step.
+const SHOWN: &str = "forklift/rgb/000006";
 /// The object that both executors look at.
 const SHARED: &str = "chicken";
 
@@ -24,14 +24,20 @@ pub fn run(arguments: &[String]) -> Result<(), String> {
     shell::run(shell::cargo().args(["build", "--release", "--bin", "sigma-pose"]))?;
     let begin = Instant::now();
 
-    println!("\nUnseen views, searched from 30° beside the true pose (neighbor4):\n");
-    let mut evaluate = sigma_pose("evaluate", model, "cpu");
-    evaluate.args(["--data", VIEWS, "--starts", "neighbor4", "--views", "1", "--force", "--out", &format!("{OUT}/neighbor4")]);
-    accept(evaluate.status())?;
+    for (starts, effort, what) in [
+        ("neighbor4", "fast", "searched from 30° beside the true pose"),
+        ("fixed24", "normal", "with no idea where the camera is: from 24 places around the object"),
+    ] {
+        println!("\nUnseen views, {what} ({starts}, effort {effort}):\n");
+        let mut evaluate = sigma_pose("evaluate", model, "cpu");
+        evaluate.args(["--data", VIEWS, "--starts", starts, "--effort", effort, "--views", "1"]);
+        evaluate.args(["--force", "--out", &format!("{OUT}/{starts}")]);
+        accept(evaluate.status())?;
+    }
 
-    println!("\nUnseen views, with no idea where the camera is (around84: from all around the object):\n");
+    println!("\nOne search in pictures, from all around (around84):\n");
     let mut estimate = sigma_pose("estimate", model, "cpu");
-    estimate.args(LOST.map(|name| format!("{VIEWS}/{name}.png")));
+    estimate.arg(format!("{VIEWS}/{SHOWN}.png"));
     estimate.args(["--starts", "around84", "--truth", "auto", "--force", "--record", &format!("{OUT}/around84")]);
     accept(estimate.status())?;
 
