@@ -163,7 +163,7 @@ fn a_calibrated_model_states_deviations() {
     let [model, calibrated] = ["model", "calibrated"].map(|name| Model::load(&dir.join(format!("{name}.safetensors"))).unwrap());
     assert_eq!(model.parameters, calibrated.parameters);
     let metadata = calibrated.metadata.calibration.unwrap();
-    assert_eq!(Some(metadata.covariance), found["covariance"].as_f64());
+    assert_eq!(Some(metadata.curvature), found["curvature"].as_f64());
 
     let estimate = |args: &str| {
         run(dir, &format!("estimate one/chicken/rgb/000003.png --executor cpu --steps 1 --starts truth.txt --no-cull {args}"), 0)

@@ -1,16 +1,21 @@
 //! How sure an estimate is. The second derivatives `B` of the loss say how a pose error shows in the picture, and so in which
-//! directions it can hide; how large the errors are, with what the renderer does not know of the object, only known poses can tell.
+//! directions it can hide. The renderer does not know the object exactly; how far off that leaves the poses, only known ones can tell.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::estimator::{Estimate, Ranked};
 
+/// A symmetric matrix over a motion, see [`motion`].
+pub type Matrix6 = [[f64; 6]; 6];
+
 /// What estimates of known poses told of a model.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
-    /// Factor from `loss · B⁻¹` to the covariance of an estimate.
-    pub covariance: f64,
+    /// The covariance of an estimate is this times `loss · B⁻¹`,
+    pub curvature: f64,
+    /// and these variances on its diagonal: what the errors of all estimates have in common.
+    pub floor: [f64; 6],
     /// Part of a picture that an estimate to be trusted leaves unexplained at most.
     pub unexplained: f64,
     /// How much higher, as a part, the loss must be at the next best pose elsewhere for an estimate to be trusted.
@@ -36,26 +41,24 @@ pub fn motion(from: &DMat4, to: &DMat4) -> [f64; 6] {
 }
 
 impl Estimate {
-    /// Covariance of the motion from the estimated pose to the true one, see [`motion`]. `None` without second derivatives, or where they
-    /// are not those of a minimum.
-    pub fn covariance(&self, calibration: &Calibration) -> Option<[[f64; 6]; 6]> {
-        let inverse = inverse(self.curvature.as_ref()?)?;
-        Some(inverse.map(|row| row.map(|value| calibration.covariance * self.loss * value)))
+    /// `loss · B⁻¹`, the shape of the estimate's errors. `None` without second derivatives, or where they are not those of a minimum.
+    pub fn shape(&self) -> Option<Matrix6> {
+        let lower = cholesky(self.curvature.as_ref()?)?;
+        // Row k of L⁻¹ᵀ is the solution for the k-th unit vector.
+        let columns: Matrix6 = std::array::from_fn(|k| forward(&lower, std::array::from_fn(|i| f64::from(i == k))));
+        let entry = |i: usize, j: usize| columns[i].iter().zip(&columns[j]).map(|(a, b)| a * b).sum::<f64>();
+        Some(std::array::from_fn(|i| std::array::from_fn(|j| self.loss * entry(i, j))))
     }
 
-    /// Squared distance of a pose from the estimate in units of `loss · B⁻¹`: over [`Calibration::covariance`], in units of the
-    /// covariance. `None` where that is none.
-    pub fn squared_distance(&self, pose: &DMat4) -> Option<f64> {
-        let curvature = self.curvature.as_ref()?;
-        inverse(curvature)?;
-        let xi = motion(&self.pose.to_matrix(), pose);
-        let product = curvature.iter().zip(xi).map(|(row, x)| x * row.iter().zip(xi).map(|(b, x)| b * x).sum::<f64>());
-        Some(product.sum::<f64>() / self.loss)
+    /// Covariance of the motion from the estimated pose to the true one; `None` where there is no [`Estimate::shape`].
+    pub fn covariance(&self, calibration: &Calibration) -> Option<Matrix6> {
+        Some(mixed(&self.shape()?, calibration.curvature, &calibration.floor))
     }
 
     /// Whether a pose lies within the ellipsoid that 95 % of all true poses lie in, if the errors are normal.
     pub fn states(&self, pose: &DMat4, calibration: &Calibration) -> Option<bool> {
-        Some(self.squared_distance(pose)? <= WITHIN_95 * calibration.covariance)
+        let (_, squared) = distance(&self.covariance(calibration)?, &motion(&self.pose.to_matrix(), pose))?;
+        Some(squared <= WITHIN_95)
     }
 
     /// The best of the other starts that went as far as the winner, but to a pose elsewhere, and by which part its loss is higher.
@@ -70,10 +73,42 @@ impl Estimate {
     }
 }
 
+/// `curvature` and `floor` of a [`Calibration`], from motions to the true poses and the shapes of their estimates: the most likely mixture of
+/// what depends on the view and what does not, then enlarged until 95 % of the motions lie within the ellipsoids that say so.
+pub fn fit(known: &[([f64; 6], Matrix6)]) -> Option<(f64, [f64; 6])> {
+    let count = known.len() as f64;
+    let mean = |of: &dyn Fn(&([f64; 6], Matrix6)) -> f64| known.iter().map(of).sum::<f64>() / count;
+    let squares: [f64; 6] = std::array::from_fn(|k| mean(&|(motion, _)| motion[k] * motion[k]));
+    // Either part alone is as large as the errors are: the mixture is looked for between them and a thousandth.
+    let whole = mean(&|(motion, shape)| distance(shape, motion).map_or(f64::NAN, |(_, squared)| squared / 6.0));
+    if squares.contains(&0.0) || !whole.is_finite() {
+        return None;
+    }
+    let parts = || std::iter::once(0.0).chain((0..=24).map(|k| 10f64.powf(-3.0 + f64::from(k) / 8.0)));
+    let distances = |a: f64, b: f64| -> Option<Vec<(f64, f64)>> {
+        let floor = squares.map(|square| b * square);
+        known.iter().map(|(motion, shape)| distance(&mixed(shape, a * whole, &floor), motion)).collect()
+    };
+    let unlikely = |distances: &[(f64, f64)]| distances.iter().map(|(log_determinant, squared)| log_determinant + squared).sum::<f64>();
+    let mixtures = parts().flat_map(|a| parts().map(move |b| (a, b)));
+    let likely = mixtures.filter_map(|(a, b)| distances(a, b).map(|distances| (unlikely(&distances), a, b)));
+    let (_, a, b) = likely.min_by(|one, other| one.0.total_cmp(&other.0))?;
+    let mut squared: Vec<f64> = distances(a, b)?.into_iter().map(|(_, squared)| squared).collect();
+    squared.sort_by(f64::total_cmp);
+    // The next one is as likely to lie anywhere between these: below the rank that 95 % of n + 1 are.
+    let rank = (0.95 * (count + 1.0)).ceil() as usize;
+    let factor = squared[rank.min(squared.len()) - 1] / WITHIN_95;
+    Some((factor * a * whole, squares.map(|square| factor * b * square)))
+}
+
 /// Standard deviations of an estimate: of the turn in degrees, and of the camera's place in object units; each the root of the sum over
 /// three axes.
-pub fn deviations(pose: &DMat4, covariance: &[[f64; 6]; 6]) -> (f64, f64) {
-    let [turn, turn_shift, shift] = blocks(covariance);
+pub fn deviations(pose: &DMat4, covariance: &Matrix6) -> (f64, f64) {
+    let block = |row: usize, column: usize| {
+        let at = |i: usize| DVec3::from_array([0, 1, 2].map(|k| covariance[row + k][column + i]));
+        DMat3::from_cols(at(0), at(1), at(2))
+    };
+    let [turn, turn_shift, shift] = [block(0, 0), block(0, 3), block(3, 3)];
     let trace = |m: DMat3| m.x_axis.x + m.y_axis.y + m.z_axis.z;
     // The camera's place moves by ω × c + υ.
     let DVec3 { x, y, z } = DMat3::from_mat4(*pose).transpose() * pose.w_axis.truncate();
@@ -82,42 +117,52 @@ pub fn deviations(pose: &DMat4, covariance: &[[f64; 6]; 6]) -> (f64, f64) {
     (trace(turn).sqrt().to_degrees(), trace(place).sqrt())
 }
 
-/// The blocks of a symmetric matrix: above left, above right, below right.
-fn blocks(m: &[[f64; 6]; 6]) -> [DMat3; 3] {
-    [(0, 0), (0, 3), (3, 3)].map(|(row, column)| {
-        let at = |i: usize| DVec3::new(m[row][column + i], m[row + 1][column + i], m[row + 2][column + i]);
-        DMat3::from_cols(at(0), at(1), at(2))
-    })
+fn mixed(shape: &Matrix6, curvature: f64, floor: &[f64; 6]) -> Matrix6 {
+    let entry = |i: usize, j: usize| curvature * shape[i][j] + if i == j { floor[i] } else { 0.0 };
+    std::array::from_fn(|i| std::array::from_fn(|j| entry(i, j)))
 }
 
-/// The inverse of a symmetric positive matrix, by its blocks.
-fn inverse(m: &[[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
-    let [a, b, d] = blocks(m);
-    let is_positive = |m: &DMat3| {
-        let minor = m.x_axis.x * m.y_axis.y - m.x_axis.y * m.y_axis.x;
-        m.is_finite() && m.x_axis.x > 0.0 && minor > 0.0 && m.determinant() > 0.0
-    };
-    let d = Some(d).filter(is_positive)?.inverse();
-    let a = Some(a - b * d * b.transpose()).filter(is_positive)?.inverse();
-    let b = -(a * b * d);
-    let d = d + b.transpose() * a.inverse() * b;
-    let at = |row: usize, column: usize| match (row < 3, column < 3) {
-        (true, true) => a.col(column)[row],
-        (true, false) => b.col(column - 3)[row],
-        (false, true) => b.col(row - 3)[column],
-        (false, false) => d.col(column - 3)[row - 3],
-    };
-    Some(std::array::from_fn(|row| std::array::from_fn(|column| at(row, column))))
+/// The logarithm of a covariance's determinant, and the squared distance of a motion from none in its units; `None` if it is not positive.
+fn distance(covariance: &Matrix6, motion: &[f64; 6]) -> Option<(f64, f64)> {
+    let lower = cholesky(covariance)?;
+    let log_determinant = (0..6).map(|k| 2.0 * lower[k][k].ln()).sum();
+    Some((log_determinant, forward(&lower, *motion).iter().map(|x| x * x).sum()))
+}
+
+/// `L` of `L Lᵀ = m`; `None` if `m` is not positive.
+fn cholesky(m: &Matrix6) -> Option<Matrix6> {
+    let mut lower = [[0.0; 6]; 6];
+    for i in 0..6 {
+        for j in 0..=i {
+            let sum = m[i][j] - (0..j).map(|k| lower[i][k] * lower[j][k]).sum::<f64>();
+            // Also where it is no number.
+            if i == j && !(sum > 0.0 && sum.is_finite()) {
+                return None;
+            }
+            lower[i][j] = if i == j { sum.sqrt() } else { sum / lower[j][j] };
+        }
+    }
+    Some(lower)
+}
+
+/// `L⁻¹ x`.
+fn forward(lower: &Matrix6, mut x: [f64; 6]) -> [f64; 6] {
+    for i in 0..6 {
+        let known: f64 = (0..i).map(|k| lower[i][k] * x[k]).sum();
+        x[i] = (x[i] - known) / lower[i][i];
+    }
+    x
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::{normal, stream};
     use crate::{Pose6, camera::look_at_origin};
 
     /// A positive matrix with unlike scales.
-    fn curvature() -> [[f64; 6]; 6] {
-        let factor: [[f64; 6]; 6] =
+    fn curvature() -> Matrix6 {
+        let factor: Matrix6 =
             std::array::from_fn(|i| std::array::from_fn(|j| ((3 * i + 5 * j) % 7) as f64 - 3.0 + if i == j { 9.0 } else { 0.0 }));
         std::array::from_fn(|i| std::array::from_fn(|j| (0..6).map(|k| factor[i][k] * factor[j][k]).sum()))
     }
@@ -128,6 +173,10 @@ mod tests {
         let turned = Pose6::from_matrix(&(DMat4::from_rotation_z(1.0) * pose.to_matrix()));
         let ranking = vec![ranked(7, 2.0, pose), ranked(3, 2.1, pose), ranked(5, 3.0, turned)];
         Estimate { pose, loss: 2.0, curvature: Some(curvature()), ranking }
+    }
+
+    fn calibration(curvature: f64, floor: [f64; 6]) -> Calibration {
+        Calibration { curvature, floor, unexplained: 1.0, rival: 0.0, views: 1 }
     }
 
     #[test]
@@ -143,47 +192,42 @@ mod tests {
     }
 
     #[test]
-    fn the_inverse_is_one() {
-        let m = curvature();
-        let product = inverse(&m).unwrap();
+    fn the_shape_is_the_inverse() {
+        let mut estimate = estimate(look_at_origin(DVec3::new(1.0, -0.6, 0.5)));
+        let (m, shape) = (curvature(), estimate.shape().unwrap());
         for i in 0..6 {
             for j in 0..6 {
-                let entry: f64 = (0..6).map(|k| m[i][k] * product[k][j]).sum();
-                assert!((entry - f64::from(i == j)).abs() < 1e-9, "{i} {j} {entry}");
+                let entry: f64 = (0..6).map(|k| m[i][k] * shape[k][j]).sum();
+                assert!((entry - 2.0 * f64::from(i == j)).abs() < 1e-9, "{i} {j} {entry}");
             }
         }
-        let mut saddle = m;
-        saddle[2][2] = -1.0;
-        assert_eq!((inverse(&saddle), inverse(&[[f64::NAN; 6]; 6])), (None, None));
+        for entry in [-1.0, f64::NAN] {
+            estimate.curvature.as_mut().unwrap()[2][2] = entry;
+            assert_eq!(estimate.shape(), None);
+        }
     }
 
     #[test]
-    fn distances_are_those_of_the_covariance() {
+    fn ellipsoids_end_where_they_say() {
         let pose = look_at_origin(DVec3::new(1.0, -0.6, 0.5));
         let estimate = estimate(pose);
-        let other = look_at_origin(DVec3::new(1.1, -0.5, 0.5));
-        let calibration = Calibration { covariance: 0.5, unexplained: 1.0, rival: 0.0, views: 1 };
-        let covariance = estimate.covariance(&calibration).unwrap();
-        let (xi, precision) = (motion(&pose, &other), inverse(&covariance).unwrap());
-        let direct: f64 = (0..6).map(|i| (0..6).map(|j| xi[i] * precision[i][j] * xi[j]).sum::<f64>()).sum();
-        let distance = estimate.squared_distance(&other).unwrap() / calibration.covariance;
-        assert!((distance / direct - 1.0).abs() < 1e-9, "{distance} {direct}");
-        assert_eq!(estimate.squared_distance(&estimate.pose.to_matrix()).map(|d| d < 1e-20), Some(true));
+        // The object's centre stays: a turn alone, and of the covariance only its variance about that axis.
+        let floor = [1e-4, 1e10, 1e10, 1e10, 1e10, 1e10];
+        let turned = |angle: f64| {
+            let turn = DMat3::from_axis_angle(pose.x_axis.truncate(), angle);
+            DMat4::from_mat3_translation(turn * DMat3::from_mat4(pose), turn * pose.w_axis.truncate())
+        };
+        let edge = (1e-4 * WITHIN_95).sqrt();
+        let states = |angle| estimate.states(&turned(angle), &calibration(0.0, floor));
+        assert_eq!((states(0.99 * edge), states(1.01 * edge)), (Some(true), Some(false)));
     }
 
     #[test]
     fn deviations_are_those_of_random_motions() {
         let pose = look_at_origin(DVec3::new(1.0, -0.6, 0.5));
-        let covariance =
-            estimate(pose).covariance(&Calibration { covariance: 1e-5, unexplained: 1.0, rival: 0.0, views: 1 }).unwrap();
-        // The sum over the covariance's principal directions, here those of a Cholesky factor, is that of all.
-        let mut lower = [[0.0; 6]; 6];
-        for i in 0..6 {
-            for j in 0..=i {
-                let sum: f64 = covariance[i][j] - (0..j).map(|k| lower[i][k] * lower[j][k]).sum::<f64>();
-                lower[i][j] = if i == j { sum.sqrt() } else { sum / lower[j][j] };
-            }
-        }
+        let covariance = estimate(pose).covariance(&calibration(1e-5, [1e-6; 6])).unwrap();
+        // The sum over the columns of a factor is that over all directions.
+        let lower = cholesky(&covariance).unwrap();
         let centre = DMat3::from_mat4(pose).transpose() * pose.w_axis.truncate();
         let (mut turns, mut places) = (0.0, 0.0);
         for k in 0..6 {
@@ -193,10 +237,32 @@ mod tests {
             places += (omega.cross(centre) + upsilon).length_squared();
         }
         let (turn, place) = deviations(&pose, &covariance);
-        assert!(
-            (turn / turns.sqrt().to_degrees() - 1.0).abs() < 1e-9 && (place / places.sqrt() - 1.0).abs() < 1e-9,
-            "{turn} {place}"
-        );
+        assert!((turn / turns.sqrt().to_degrees() - 1.0).abs() < 1e-9 && (place / places.sqrt() - 1.0).abs() < 1e-9, "{turn} {place}");
+    }
+
+    /// Errors of both kinds in a known mixture: the fit finds it, and its ellipsoids hold what they should of others like them.
+    #[test]
+    fn the_fit_finds_the_mixture() {
+        let mut random = stream(1, 2);
+        let floor = [4e-4, 1e-4, 1e-4, 1e-5, 1e-5, 4e-5];
+        let mut draw = |count: usize| -> Vec<([f64; 6], Matrix6)> {
+            let one = |_| {
+                let size = 10f64.powf(normal(&mut random));
+                let m = curvature();
+                let shape: Matrix6 = std::array::from_fn(|i| std::array::from_fn(|j| size * m[i][j] * 1e-6));
+                let lower = cholesky(&mixed(&shape, 0.3, &floor)).unwrap();
+                let numbers: [f64; 6] = std::array::from_fn(|_| normal(&mut random));
+                (std::array::from_fn(|i| (0..6).map(|k| lower[i][k] * numbers[k]).sum()), shape)
+            };
+            (0..count).map(one).collect()
+        };
+        let (known, others) = (draw(400), draw(2000));
+        let (curvature, found) = fit(&known).unwrap();
+        assert!((0.2..0.45).contains(&curvature), "{curvature}");
+        let inside = |(motion, shape): &&([f64; 6], Matrix6)| distance(&mixed(shape, curvature, &found), motion).unwrap().1 <= WITHIN_95;
+        let share = others.iter().filter(inside).count() as f64 / 2000.0;
+        assert!((0.93..0.97).contains(&share), "{share} {curvature} {found:?}");
+        assert_eq!((fit(&[]), fit(&[([0.0; 6], self::curvature())])), (None, None));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use sigma_srn::Calibration;
-use sigma_srn::confidence::WITHIN_95;
+use sigma_srn::confidence::{Matrix6, fit, motion};
 
 use super::files::Picture;
 use super::notation::Notation;
@@ -54,8 +54,10 @@ pub struct Calibrate {
 #[derive(Clone, Copy, Debug)]
 struct Known {
     rotation_deg: f64,
-    /// See `Estimate::squared_distance`.
-    squared_distance: Option<f64>,
+    /// From the estimate to the truth.
+    motion: [f64; 6],
+    /// See `Estimate::shape`.
+    shape: Option<Matrix6>,
     unexplained: f64,
     /// Infinite without a rival.
     rival: f64,
@@ -90,7 +92,8 @@ pub fn run(args: &Calibrate) -> Result<bool> {
         })?;
         known.extend(found.iter().zip(truths).map(|(found, truth)| Known {
             rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
-            squared_distance: found.estimate.squared_distance(truth),
+            motion: motion(&found.world_from_camera, truth),
+            shape: found.estimate.shape(),
             unexplained: found.unexplained,
             rival: found.estimate.rival().map_or(f64::INFINITY, |(_, higher)| higher),
         }));
@@ -103,9 +106,12 @@ pub fn run(args: &Calibrate) -> Result<bool> {
         print(&serde_json::to_string_pretty(&calibration)?)?;
     } else {
         let failures = known.iter().filter(|known| known.has_failed()).count();
-        let Calibration { covariance, unexplained, rival, views } = calibration;
+        let Calibration { curvature, floor, unexplained, rival, views } = calibration;
         print(&format!("{views} views, {failures} of them more than {}° off", PoseError::FAILURE_DEG))?;
-        print(&format!("covariance: {covariance:.4} × loss × inverse of its second derivatives"))?;
+        print(&format!("covariance: {curvature:.2e} × loss × inverse of its second derivatives"))?;
+        let [a, b, c] = [0, 1, 2].map(|k| floor[k].sqrt().to_degrees());
+        let [x, y, z] = [3, 4, 5].map(|k| floor[k].sqrt());
+        print(&format!("and in all views ± {a:.2}° {b:.2}° {c:.2}° about the camera's axes, ± {x:.4} {y:.4} {z:.4} along them"))?;
         print(&format!(
             "trusted: at most {:.1} % unexplained, and a loss {:.1} % higher elsewhere",
             100.0 * unexplained,
@@ -119,13 +125,10 @@ pub fn run(args: &Calibrate) -> Result<bool> {
 /// What the searches tell of others. `None` if none of them has second derivatives and found its pose.
 fn calibration(known: &[Known]) -> Option<Calibration> {
     let found = known.iter().filter(|known| !known.has_failed());
-    let mut distances: Vec<f64> = found.filter_map(|known| known.squared_distance).collect();
-    distances.sort_by(f64::total_cmp);
-    // One more, the next, is as likely to lie anywhere between them: the rank that 95 % of n + 1 lie below.
-    let rank = (0.95 * (distances.len() + 1) as f64).ceil() as usize;
-    let distance = *distances.get(rank.min(distances.len()).checked_sub(1)?)?;
+    let errors: Vec<_> = found.filter_map(|known| known.shape.map(|shape| (known.motion, shape))).collect();
+    let (curvature, floor) = fit(&errors)?;
     let (unexplained, rival) = limits(known);
-    Some(Calibration { covariance: distance / WITHIN_95, unexplained, rival, views: known.len() as u32 })
+    Some(Calibration { curvature, floor, unexplained, rival, views: known.len() as u32 })
 }
 
 /// The limits of what is unexplained and of the rival that tell the failures best: by the harmonic mean of precision and recall.
@@ -165,24 +168,24 @@ fn limits(known: &[Known]) -> (f64, f64) {
 mod tests {
     use super::*;
 
-    fn known(rotation_deg: f64, squared_distance: f64, unexplained: f64, rival: f64) -> Known {
-        Known { rotation_deg, squared_distance: Some(squared_distance), unexplained, rival }
+    fn known(rotation_deg: f64, unexplained: f64, rival: f64) -> Known {
+        let shape = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
+        Known { rotation_deg, motion: [0.01; 6], shape: Some(shape), unexplained, rival }
     }
 
     #[test]
-    fn the_covariance_holds_for_95_in_100() {
-        let views: Vec<Known> = (1..=99).map(|k| known(1.0, f64::from(k), 0.1, f64::INFINITY)).collect();
+    fn without_failures_the_limits_are_loose() {
+        let views: Vec<Known> = (1..=9).map(|k| known(1.0, 0.01 * f64::from(k), f64::INFINITY)).collect();
         let found = calibration(&views).unwrap();
-        assert!((found.covariance * WITHIN_95 - 95.0).abs() < 1e-9, "{found:?}");
-        assert!((found.unexplained - 0.15).abs() < 1e-12 && found.rival == 0.0 && found.views == 99);
-        assert_eq!(calibration(&[known(90.0, 1.0, 0.1, 1.0)]), None);
+        assert!((found.unexplained - 0.135).abs() < 1e-12 && found.rival == 0.0 && found.views == 9, "{found:?}");
+        assert_eq!(calibration(&[known(90.0, 0.1, 1.0)]), None);
     }
 
     #[test]
     fn limits_tell_failures_by_either_sign() {
-        let mut views: Vec<Known> = (0..20).map(|k| known(1.0, 1.0, 0.1 + 0.002 * f64::from(k), 0.5)).collect();
-        views.push(known(90.0, 1.0, 0.3, 0.5));
-        views.push(known(170.0, 1.0, 0.1, 0.02));
+        let mut views: Vec<Known> = (0..20).map(|k| known(1.0, 0.1 + 0.002 * f64::from(k), 0.5)).collect();
+        views.push(known(90.0, 0.3, 0.5));
+        views.push(known(170.0, 0.1, 0.02));
         let (unexplained, rival) = limits(&views);
         assert!((0.14..0.3).contains(&unexplained) && (0.02..0.5).contains(&rival), "{unexplained} {rival}");
     }
