@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::Model;
+use sigma_srn::{Engine, Model};
 use srn_data::camera::Axes;
 use srn_data::sheet;
 
@@ -14,6 +14,7 @@ use super::files::{Picture, create_dir, write_png};
 use super::notation::{Notation, NotationArgs};
 use super::search::{Confidence, Found, PoseError, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
+use super::symmetry::Symmetries;
 use super::tables;
 use super::views::{self, Views};
 use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
@@ -53,6 +54,10 @@ pub struct Evaluate {
     /// For --tables: how many of all views the paper's preset searches for, which takes minutes a view on a CPU. Default: all.
     #[arg(long, value_name = "N", requires = "tables", value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) paper_views: Option<u32>,
+    /// Count poses as right from which the object looks the same: turns about its axes that the model's own views do not show. Some
+    /// seconds per instance on a CPU.
+    #[arg(long)]
+    pub(super) symmetries: bool,
     /// Print everything as JSON.
     #[arg(long)]
     pub(super) json: bool,
@@ -143,9 +148,10 @@ pub fn run(args: &Evaluate) -> Result<bool> {
             bar.set_position(i as u64 * steps + u64::from(progress.step));
             Ok(())
         })?;
+        let symmetries = args.symmetries_of(&engine, &model, side, pictures, truths)?;
         let reports = pictures.iter().zip(*truths).zip(found);
         for ((picture, truth), found) in reports {
-            let report = view_report(&model, name, picture, truth, &found, notation.axes, source.as_ref());
+            let report = view_report(&model, name, picture, (truth, &symmetries), &found, notation.axes, source.as_ref());
             results.push((report, picture, found));
         }
     }
@@ -177,13 +183,15 @@ pub(super) fn view_report(
     model: &Model,
     instance: &str,
     picture: &Picture,
-    truth: &DMat4,
+    (truth, symmetries): (&DMat4, &Symmetries),
     found: &Found,
     convention: Axes,
     source: Option<&Notation>,
 ) -> ViewReport {
-    let errors = found.estimate.ranking.iter().map(|r| PoseError::of(&r.pose.to_matrix(), truth));
-    let error = PoseError::of(&found.world_from_camera, truth);
+    let error_of = |pose: &DMat4| PoseError::of(pose, &symmetries.nearest(truth, pose));
+    let errors = found.estimate.ranking.iter().map(|r| error_of(&r.pose.to_matrix()));
+    let truth = &symmetries.nearest(truth, &found.world_from_camera);
+    let error = error_of(&found.world_from_camera);
     let within_95 = model.metadata.calibration.and_then(|calibration| found.estimate.states(truth, &calibration));
     ViewReport {
         instance: instance.into(),
@@ -227,6 +235,23 @@ pub(super) fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u3
     sheet::text(&mut page, 4, 8, "target | view from the estimated pose | difference; the worst first", sheet::BLACK);
     image::imageops::replace(&mut page, &grid, 0, 24);
     page
+}
+
+impl Evaluate {
+    /// Those of the instance in the pictures, if they count.
+    pub(super) fn symmetries_of(
+        &self,
+        engine: &Engine,
+        model: &Model,
+        side: u32,
+        pictures: &[Picture],
+        truths: &[DMat4],
+    ) -> Result<Symmetries> {
+        let (Some(picture), Some(truth), true) = (pictures.first(), truths.first(), self.symmetries) else {
+            return Ok(Symmetries::none());
+        };
+        Symmetries::find(engine, model, picture.instance, side, picture.intrinsics, truth.w_axis.truncate().length())
+    }
 }
 
 impl ViewReport {

@@ -12,6 +12,7 @@ mod record;
 pub mod render;
 mod search;
 mod summary;
+mod symmetry;
 mod tables;
 pub mod track;
 mod views;

@@ -13,6 +13,7 @@ use super::files::{Picture, create_dir, write_png};
 use super::notation::Notation;
 use super::search::{Found, LOSSES, PoseError, Preset, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
+use super::symmetry::Symmetries;
 use super::views::{self, Views, spread};
 use crate::common::{Result, load_model, load_set, progress, refuse_existing};
 use crate::train::adapt::{FitCodes, fit_codes};
@@ -70,6 +71,8 @@ struct Bench<'a> {
     args: &'a Evaluate,
     engine: Engine,
     dir: &'a Path,
+    /// Of the instances, held out or not.
+    symmetries: Vec<(bool, String, Symmetries)>,
     outcomes: Vec<Outcome>,
 }
 
@@ -83,7 +86,7 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     refuse_existing(paths.clone(), args.force)?;
     create_dir(dir)?;
 
-    let mut bench = Bench { args, engine: args.engine.open()?, dir, outcomes: vec![] };
+    let mut bench = Bench { args, engine: args.engine.open()?, dir, symmetries: vec![], outcomes: vec![] };
     let mae = LOSSES[0];
     let setting = |table, preset, starts: &Starts| Setting {
         table,
@@ -181,11 +184,22 @@ impl Bench<'_> {
                 search.starts(&setting.starts, model, picture, side, Some(truth), &notation)
             };
             let starts = pictures.iter().zip(truths).map(starts).collect::<Result<Vec<_>>>()?;
+            // Found once: the same for all presets. Of an unknown object the model can show no views.
+            let symmetries = match self.symmetries.iter().find(|known| (known.0, &known.1) == (setting.table == 2, name)) {
+                _ if setting.preset.is_none() => Symmetries::none(),
+                Some((.., symmetries)) => symmetries.clone(),
+                None => {
+                    let found = self.args.symmetries_of(&self.engine, model, side, pictures, truths)?;
+                    self.symmetries.push((setting.table == 2, name.clone(), found.clone()));
+                    found
+                }
+            };
+            let error = |pose: &DMat4, truth: &DMat4| PoseError::of(pose, &symmetries.nearest(truth, pose)).rotation_deg;
             let (began, mut number) = (Instant::now(), 0);
             if setting.preset.is_none() {
                 for ((picture, truth), starts) in pictures.iter().zip(truths).zip(&starts) {
                     let (found, _) = search.run_unseen(&self.engine, model, side, picture, starts, |_, _| Ok(()))?;
-                    let report = view_report(model, name, picture, truth, &found, Axes::OpenCv, None);
+                    let report = view_report(model, name, picture, (truth, &symmetries), &found, Axes::OpenCv, None);
                     results.push((report, picture.clone(), found));
                 }
                 continue;
@@ -199,14 +213,14 @@ impl Bench<'_> {
                 for (query, truth) in truths.iter().enumerate() {
                     let own = standing.iter().zip(progress.hypotheses).filter(|(_, name)| name.0 == query);
                     let best = own.min_by(|(a, _), (b, _)| a.0.total_cmp(&b.0)).expect("every query has a hypothesis");
-                    moments[number].errors.push(PoseError::of(&best.0.1.to_matrix(), truth).rotation_deg);
+                    moments[number].errors.push(error(&best.0.1.to_matrix(), truth));
                 }
                 moments[number].seconds += began.elapsed().as_secs_f64();
                 number += 1;
                 Ok(())
             })?;
             for ((picture, truth), found) in pictures.iter().zip(truths).zip(found) {
-                let report = view_report(model, name, picture, truth, &found, Axes::OpenCv, None);
+                let report = view_report(model, name, picture, (truth, &symmetries), &found, Axes::OpenCv, None);
                 results.push((report, picture.clone(), found));
             }
         }
