@@ -208,7 +208,8 @@ fn frames_are_followed() {
 fn tables_hold_every_preset() {
     let home = home();
     let dir = home.path();
-    let args = "evaluate --model model.safetensors --data DATA --heldout DATA --instances 1 --views 1 --paper-views 1 --executor cpu";
+    let args =
+        "evaluate --model model.safetensors --data DATA --heldout DATA --instances 1 --views 1 --paper-views 1 --executor cpu";
     run(dir, &format!("{args} --tables tables"), 0);
     assert_eq!(files(&dir.join("tables")), ["convergence.csv", "convergence.png", "tables.md", "views.csv", "worst.png"]);
     let tables = fs::read_to_string(dir.join("tables/tables.md")).unwrap();

@@ -9,6 +9,9 @@ use crate::estimator::{Estimate, Ranked};
 /// A symmetric matrix over a motion, see [`motion`].
 pub type Matrix6 = [[f64; 6]; 6];
 
+/// The motion from an estimate to the true pose, and the estimate's [`Estimate::shape`].
+pub type Known = ([f64; 6], Matrix6);
+
 /// What estimates of known poses told of a model.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
@@ -75,9 +78,9 @@ impl Estimate {
 
 /// `curvature` and `floor` of a [`Calibration`], from motions to the true poses and the shapes of their estimates: the most likely mixture of
 /// what depends on the view and what does not, then enlarged until 95 % of the motions lie within the ellipsoids that say so.
-pub fn fit(known: &[([f64; 6], Matrix6)]) -> Option<(f64, [f64; 6])> {
+pub fn fit(known: &[Known]) -> Option<(f64, [f64; 6])> {
     let count = known.len() as f64;
-    let mean = |of: &dyn Fn(&([f64; 6], Matrix6)) -> f64| known.iter().map(of).sum::<f64>() / count;
+    let mean = |of: &dyn Fn(&Known) -> f64| known.iter().map(of).sum::<f64>() / count;
     let squares: [f64; 6] = std::array::from_fn(|k| mean(&|(motion, _)| motion[k] * motion[k]));
     // Either part alone is as large as the errors are: the mixture is looked for between them and a thousandth.
     let whole = mean(&|(motion, shape)| distance(shape, motion).map_or(f64::NAN, |(_, squared)| squared / 6.0));
@@ -89,7 +92,8 @@ pub fn fit(known: &[([f64; 6], Matrix6)]) -> Option<(f64, [f64; 6])> {
         let floor = squares.map(|square| b * square);
         known.iter().map(|(motion, shape)| distance(&mixed(shape, a * whole, &floor), motion)).collect()
     };
-    let unlikely = |distances: &[(f64, f64)]| distances.iter().map(|(log_determinant, squared)| log_determinant + squared).sum::<f64>();
+    let unlikely =
+        |distances: &[(f64, f64)]| distances.iter().map(|(log_determinant, squared)| log_determinant + squared).sum::<f64>();
     let mixtures = parts().flat_map(|a| parts().map(move |b| (a, b)));
     let likely = mixtures.filter_map(|(a, b)| distances(a, b).map(|distances| (unlikely(&distances), a, b)));
     let (_, a, b) = likely.min_by(|one, other| one.0.total_cmp(&other.0))?;
@@ -237,7 +241,10 @@ mod tests {
             places += (omega.cross(centre) + upsilon).length_squared();
         }
         let (turn, place) = deviations(&pose, &covariance);
-        assert!((turn / turns.sqrt().to_degrees() - 1.0).abs() < 1e-9 && (place / places.sqrt() - 1.0).abs() < 1e-9, "{turn} {place}");
+        assert!(
+            (turn / turns.sqrt().to_degrees() - 1.0).abs() < 1e-9 && (place / places.sqrt() - 1.0).abs() < 1e-9,
+            "{turn} {place}"
+        );
     }
 
     /// Errors of both kinds in a known mixture: the fit finds it, and its ellipsoids hold what they should of others like them.
@@ -245,7 +252,7 @@ mod tests {
     fn the_fit_finds_the_mixture() {
         let mut random = stream(1, 2);
         let floor = [4e-4, 1e-4, 1e-4, 1e-5, 1e-5, 4e-5];
-        let mut draw = |count: usize| -> Vec<([f64; 6], Matrix6)> {
+        let mut draw = |count: usize| -> Vec<Known> {
             let one = |_| {
                 let size = 10f64.powf(normal(&mut random));
                 let m = curvature();
@@ -259,7 +266,7 @@ mod tests {
         let (known, others) = (draw(400), draw(2000));
         let (curvature, found) = fit(&known).unwrap();
         assert!((0.2..0.45).contains(&curvature), "{curvature}");
-        let inside = |(motion, shape): &&([f64; 6], Matrix6)| distance(&mixed(shape, curvature, &found), motion).unwrap().1 <= WITHIN_95;
+        let inside = |(motion, shape): &&Known| distance(&mixed(shape, curvature, &found), motion).unwrap().1 <= WITHIN_95;
         let share = others.iter().filter(inside).count() as f64 / 2000.0;
         assert!((0.93..0.97).contains(&share), "{share} {curvature} {found:?}");
         assert_eq!((fit(&[]), fit(&[([0.0; 6], self::curvature())])), (None, None));

@@ -167,8 +167,8 @@ pub fn run(args: &Estimate) -> Result<bool> {
     })?;
     bar.finish_and_clear();
 
-    let names = pictures.iter().map(|picture| model.instance_name(picture.instance)).collect();
-    report(args, &engine, names, &pictures, &found, &sources).print(args, &found, &notation)?;
+    let names: Vec<String> = pictures.iter().map(|picture| model.instance_name(picture.instance)).collect();
+    report(args, &engine, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
     if let Some(dir) = &args.record {
         for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
             log.write(dir, i, picture, found, &engine, &model, side)?;
@@ -207,7 +207,7 @@ fn unseen(
     }
     bar.finish_and_clear();
     let names = vec!["unseen".to_string(); pictures.len()];
-    report(args, engine, names, pictures, &found, sources).print(args, &found, notation)?;
+    report(args, engine, &names, pictures, &found, sources).print(args, &found, notation)?;
     Ok(found.iter().all(|found| found.trusted))
 }
 
@@ -245,16 +245,16 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
 fn report(
     args: &Estimate,
     engine: &Engine,
-    names: Vec<String>,
+    names: &[String],
     pictures: &[Picture],
     found: &[Found],
     sources: &[Option<Notation>],
 ) -> Report {
     let convention = args.poses.convention;
-    let image = |((((image, picture), instance), found), source): ((((&PathBuf, &Picture), String), &Found), &Option<Notation>)| {
+    let image = |(k, found): (usize, &Found)| {
         let world_from_camera = convention.of_ours(found.world_from_camera);
         let [a, b, c, x, y, z] = Pose6::from_matrix(&world_from_camera).0;
-        let error = |pose: &DMat4| picture.truth.map(|truth| PoseError::of(pose, &truth));
+        let error = |pose: &DMat4| pictures[k].truth.map(|truth| PoseError::of(pose, &truth));
         let ranked = |r: &sigma_srn::Ranked| RankedReport {
             start: r.start,
             loss: r.loss,
@@ -267,10 +267,10 @@ fn report(
             world_from_camera: convention.of_ours(r.pose.to_matrix()).transpose().to_cols_array_2d(),
         };
         ImageReport {
-            image: image.clone(),
-            instance,
+            image: args.images[k].clone(),
+            instance: names[k].clone(),
             world_from_camera: world_from_camera.transpose().to_cols_array_2d(),
-            source_from_camera: source.map(|source| source.rows(&found.world_from_camera)),
+            source_from_camera: sources[k].map(|source| source.rows(&found.world_from_camera)),
             euler_rad: [a, b, c],
             translation: [x, y, z],
             loss: found.estimate.loss,
@@ -288,7 +288,7 @@ fn report(
         executor: engine.to_string(),
         seconds: found.iter().map(|found| found.seconds).sum(),
         convention,
-        images: args.images.iter().zip(pictures).zip(names).zip(found).zip(sources).map(image).collect(),
+        images: found.iter().enumerate().map(image).collect(),
     }
 }
 

@@ -10,8 +10,8 @@ use serde::Serialize;
 use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
 use sigma_srn::confidence::deviations;
 use sigma_srn::{
-    Calibration, Effort, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer, Rendering, Unseen,
-    estimate, estimate_unseen,
+    Calibration, Effort, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer, Rendering,
+    Unseen, estimate, estimate_unseen,
 };
 
 use super::files::Picture;

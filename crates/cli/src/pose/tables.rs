@@ -6,8 +6,8 @@ use std::time::Instant;
 use glam::DMat4;
 use sigma_srn::{Engine, Loss, Model};
 use srn_data::camera::Axes;
-use srn_data::{Dataset, Instance};
 use srn_data::sheet::{self, CURVES, Curve};
+use srn_data::{Dataset, Instance};
 
 use super::evaluate::{Evaluate, ViewReport, pictures_sheet, view_report};
 use super::files::{Picture, create_dir, write_png};
@@ -113,7 +113,12 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     }
     // The paper's preset, what takes longest at the end.
     for (k, loss) in LOSSES.into_iter().enumerate() {
-        bench.search(&model, side, &few(&asked), Setting { loss: Some(loss), ..setting(3, Preset::Paper, &Starts::Neighbor4) })?;
+        bench.search(
+            &model,
+            side,
+            &few(&asked),
+            Setting { loss: Some(loss), ..setting(3, Preset::Paper, &Starts::Neighbor4) },
+        )?;
         if let (0, Some((fitted, unseen))) = (k, &unknown) {
             bench.search(fitted, side, &few(unseen), setting(2, Preset::Paper, &Starts::Neighbor4))?;
         }
@@ -269,7 +274,7 @@ impl Bench<'_> {
         }
         write(FILES[1], rows)?;
         write(FILES[2], curves)?;
-        Ok(write_png(&self.dir.join(FILES[3]), &self.convergence())?)
+        write_png(&self.dir.join(FILES[3]), &self.convergence())
     }
 
     /// The tables in Markdown.

@@ -102,7 +102,8 @@ pub fn run(args: &Track) -> Result<bool> {
             before = vec![rough.read(path, &notation)?];
         }
         let run = |options: &Options, starts: Vec<DMat4>| -> Result<Found> {
-            let found = args.search.run_with(options, &engine, &model, side, std::slice::from_ref(&picture), &[starts], |_| Ok(()));
+            let found =
+                args.search.run_with(options, &engine, &model, side, std::slice::from_ref(&picture), &[starts], |_| Ok(()));
             Ok(found?.swap_remove(0))
         };
         let followed = match before[..] {
@@ -154,7 +155,10 @@ pub fn run(args: &Track) -> Result<bool> {
         let mean = |of: fn(&PoseError) -> f64| errors.iter().map(of).sum::<f64>() / errors.len() as f64;
         let (turn, shift) = (mean(|error| error.rotation_deg), mean(|error| error.translation));
         let worst = errors.iter().map(|error| error.rotation_deg).fold(0.0, f64::max);
-        eprintln!("{} frames, {searches} searched all around; error {turn:.2}° {shift:.3} in the mean, {worst:.2}° at worst", frames.len());
+        eprintln!(
+            "{} frames, {searches} searched all around; error {turn:.2}° {shift:.3} in the mean, {worst:.2}° at worst",
+            frames.len()
+        );
     }
     Ok(trusted)
 }
