@@ -210,6 +210,11 @@ fn tables_hold_every_preset() {
     let dir = home.path();
     let args =
         "evaluate --model model.safetensors --data DATA --heldout DATA --instances 1 --views 1 --paper-views 1 --executor cpu";
+    for file in ["rgb/000003.png", "pose/000003.txt", "rgb/000004.png", "pose/000004.txt", "intrinsics.txt"] {
+        let copy = dir.join("two/seat").join(file);
+        fs::create_dir_all(copy.parent().unwrap()).unwrap();
+        fs::copy(format!("{TEST}/seat/{file}"), copy).unwrap();
+    }
     run(dir, &format!("{args} --tables tables"), 0);
     assert_eq!(files(&dir.join("tables")), ["convergence.csv", "convergence.png", "tables.md", "views.csv", "worst.png"]);
     let tables = fs::read_to_string(dir.join("tables/tables.md")).unwrap();
@@ -223,6 +228,7 @@ fn tables_hold_every_preset() {
     let steps = fs::read_to_string(dir.join("tables/convergence.csv")).unwrap();
     assert!(steps.lines().any(|line| line.starts_with("paper,mae,fixed24,300,")), "{steps}");
     fail(dir, &format!("{args} --tables tables"), &["tables.md", "--force"]);
+    fail(dir, &format!("{} --tables other", args.replace("heldout DATA", "heldout two")), &["seat", "has 2 views"]);
     fail(dir, &format!("{args} --tables other --preset paper"), &["--tables", "--radius"]);
     fail(dir, &format!("{args} --starts fixed24 --tables other"), &["--starts", "--tables"]);
 }

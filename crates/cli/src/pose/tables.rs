@@ -23,6 +23,8 @@ use crate::train::adapt::{FitCodes, fit_codes};
 const FILES: [&str; 5] = ["tables.md", "views.csv", "convergence.csv", "convergence.png", "worst.png"];
 /// In the order of the tables; the first two are the paper's.
 const STARTS: [Starts; 3] = [Starts::Neighbor4, Starts::Fixed24, Starts::Around84];
+/// Views that the code of an object is fitted to, which the model was not trained on.
+const SHOTS: usize = 2;
 /// Searches on the page of the worst.
 const WORST: usize = 24;
 
@@ -83,6 +85,9 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     let (side, asked) = views::open(&model, &args.data, args.instances, args.views)?;
     args.search.with(Preset::Default, None)?;
     let heldout = args.heldout.as_ref().map(|heldout| load_set(heldout, side)).transpose()?;
+    if let Some(few) = heldout.iter().flat_map(|set| &set.instances).find(|instance| instance.views.len() <= SHOTS) {
+        return Err(format!("--heldout: `{}` has {} views; {SHOTS} are for its code", few.name, few.views.len()).into());
+    }
     let paths = FILES.map(|file| dir.join(file));
     refuse_existing(paths.clone(), args.force)?;
     create_dir(dir)?;
@@ -136,7 +141,7 @@ fn two_shot(engine: &Engine, args: &Evaluate, model: &Model, mut set: Dataset, s
     set.instances = spread(set.instances, args.instances as usize);
     let model = model.with_new_instances(set.instances.iter().map(|instance| instance.name.clone()).collect())?;
     // Two views a quarter of the way from either end.
-    let fitted = |count: usize| [count / 4, count - 1 - count / 4];
+    let fitted = |count: usize| -> [usize; SHOTS] { [count / 4, count - 1 - count / 4] };
     let instances = || (0..).zip(&set.instances);
     let of = |(i, instance): (u32, &'_ Instance)| fitted(instance.views.len()).map(|k| (i, k));
     let shown: Vec<_> = instances().flat_map(of).map(|(i, k)| (i, &set.instances[i as usize].views[k])).collect();
