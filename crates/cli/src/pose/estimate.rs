@@ -180,7 +180,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
 }
 
 /// Poses of objects that are not in the model.
-#[allow(clippy::too_many_arguments)] // what `run` has read
+#[expect(clippy::too_many_arguments, reason = "what `run` has read")]
 fn unseen(
     args: &Estimate,
     engine: &Engine,

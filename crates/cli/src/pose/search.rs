@@ -69,7 +69,6 @@ pub struct SearchArgs {
 
 /// Settings of a search.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-#[allow(missing_docs)] // told at --preset
 pub enum Preset {
     Default,
     Paper,
@@ -192,7 +191,7 @@ impl SearchArgs {
     }
 
     /// The same with other settings of the estimator.
-    #[allow(clippy::too_many_arguments)] // those of `run`, and one more
+    #[expect(clippy::too_many_arguments, reason = "those of `run`, and one more")]
     pub fn run_with(
         &self,
         options: &Options,
