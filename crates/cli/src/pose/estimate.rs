@@ -29,7 +29,7 @@ pub struct Estimate {
     /// Name or number of the object in the pictures. Default: the name of the SRN folder that a picture lies in.
     #[arg(long, value_name = "NAME")]
     instance: Option<String>,
-    /// The object is none of the model's, but of their kind: a latent code is fitted to each picture together with the pose, beginning with
+    /// An experiment. The object is none of the model's, but of their kind: a latent code is fitted to each picture together with the pose, beginning with
     /// those of the objects that look most alike.
     #[arg(long, conflicts_with_all = ["instance", "record"])]
     unseen: bool,
