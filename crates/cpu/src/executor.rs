@@ -1,5 +1,10 @@
-use srn_plan::{BufferId, Element, Executor, ExecutorError, Plan, StageId, Step};
+use std::ops::Range;
 
+use rayon::prelude::*;
+use srn_plan::{BufferId, Element, Executor, ExecutorError, Plan, StageId, Step};
+use srn_shaders::{ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointParams, RowsParams};
+
+use crate::chain::{Chain, Link, RowWise, Split};
 use crate::{Real, ops};
 
 /// The values of one buffer.
@@ -43,12 +48,110 @@ impl<T> Storage<T> {
             Storage::F(_) => unreachable!("the builder checks element types"),
         }
     }
+
+    /// All values, to read.
+    fn whole(&self) -> Part<'_, T> {
+        match self {
+            Storage::F(values) => Part::F(values),
+            Storage::U(values) => Part::U(values),
+        }
+    }
+
+    /// All values, to write.
+    fn whole_mut(&mut self) -> Part<'_, T> {
+        match self {
+            Storage::F(values) => Part::FMut(values),
+            Storage::U(values) => Part::UMut(values),
+        }
+    }
+}
+
+/// What a block of rows has of a buffer.
+#[derive(Debug)]
+enum Part<'a, T> {
+    F(&'a [T]),
+    FMut(&'a mut [T]),
+    U(&'a [u32]),
+    UMut(&'a mut [u32]),
+}
+
+impl<T> Default for Part<'_, T> {
+    fn default() -> Self {
+        Part::U(&[])
+    }
+}
+
+impl<'a, T> Part<'a, T> {
+    fn f(&self) -> &[T] {
+        match self {
+            Part::F(values) => values,
+            Part::FMut(values) => values,
+            Part::U(_) | Part::UMut(_) => unreachable!("the builder checks element types"),
+        }
+    }
+
+    fn u(&self) -> &[u32] {
+        match self {
+            Part::U(values) => values,
+            Part::UMut(values) => values,
+            Part::F(_) | Part::FMut(_) => unreachable!("the builder checks element types"),
+        }
+    }
+
+    fn f_mut(&mut self) -> &mut [T] {
+        match self {
+            Part::FMut(values) => values,
+            _ => unreachable!("what is written was taken out to be written"),
+        }
+    }
+
+    fn u_mut(&mut self) -> &mut [u32] {
+        match self {
+            Part::UMut(values) => values,
+            _ => unreachable!("what is written was taken out to be written"),
+        }
+    }
+
+    /// Takes the first values off.
+    fn split_off(&mut self, count: usize) -> Part<'a, T> {
+        let (first, rest) = match std::mem::take(self) {
+            Part::F(values) => {
+                let (first, rest) = values.split_at(count);
+                (Part::F(first), Part::F(rest))
+            }
+            Part::FMut(values) => {
+                let (first, rest) = values.split_at_mut(count);
+                (Part::FMut(first), Part::FMut(rest))
+            }
+            Part::U(values) => {
+                let (first, rest) = values.split_at(count);
+                (Part::U(first), Part::U(rest))
+            }
+            Part::UMut(values) => {
+                let (first, rest) = values.split_at_mut(count);
+                (Part::UMut(first), Part::UMut(rest))
+            }
+        };
+        *self = rest;
+        first
+    }
+
+    /// The same values once more, of what is only read.
+    fn again(&self) -> Part<'a, T> {
+        match self {
+            Part::F(values) => Part::F(values),
+            Part::U(values) => Part::U(values),
+            Part::FMut(_) | Part::UMut(_) => unreachable!("only one step that is done as a whole writes whole buffers"),
+        }
+    }
 }
 
 /// Runs a plan on the CPU in `T`, with all threads of the current rayon pool.
 #[derive(Debug)]
 pub struct CpuExecutor<T> {
     plan: Plan,
+    /// Of each stage.
+    chains: Vec<Vec<Chain>>,
     buffers: Vec<Storage<T>>,
 }
 
@@ -72,7 +175,8 @@ impl<T: Real> CpuExecutor<T> {
                 Element::U32 => Storage::U(vec![0; buffer.len]),
             })
             .collect();
-        Ok(CpuExecutor { plan, buffers })
+        let chains = plan.stages.iter().map(|stage| Chain::of(&stage.steps, split)).collect();
+        Ok(CpuExecutor { plan, chains, buffers })
     }
 
     fn check(&self, id: BufferId, element: Element, got: usize) -> Result<(), ExecutorError> {
@@ -86,16 +190,41 @@ impl<T: Real> CpuExecutor<T> {
         Ok(())
     }
 
-    /// Takes the written buffers out for the time of the step, so that inputs and outputs can be borrowed together.
-    fn execute(buffers: &mut [Storage<T>], step: &Step) {
-        let is_written = |binding: usize| step.kernel.bindings[binding].written;
-        let (written, read): (Vec<usize>, Vec<usize>) = (0..step.buffers.len()).partition(|&binding| is_written(binding));
-        let mut outputs: Vec<Storage<T>> =
-            written.iter().map(|&binding| std::mem::take(&mut buffers[step.buffers[binding].index()])).collect();
-        let inputs: Vec<&Storage<T>> = read.iter().map(|&binding| &buffers[step.buffers[binding].index()]).collect();
-        dispatch(step, &inputs, &mut outputs);
-        for (&binding, output) in written.iter().zip(outputs) {
-            buffers[step.buffers[binding].index()] = output;
+    /// Runs the steps of a chain. What they write is taken out for that time, so that blocks of it can be borrowed beside what they read.
+    fn execute(buffers: &mut [Storage<T>], steps: &[Step], chain: &Chain) {
+        let taken = chain.places.iter().filter(|place| place.written);
+        let mut taken: Vec<Storage<T>> = taken.map(|place| std::mem::take(&mut buffers[place.buffer.index()])).collect();
+        let mut blocks: Vec<Vec<Part<T>>> = Vec::new();
+        blocks.resize_with(chain.blocks.len().max(1), || Vec::with_capacity(chain.places.len()));
+        let mut written = taken.iter_mut();
+        for place in &chain.places {
+            let mut rest = match place.written {
+                true => written.next().expect("one is taken for each").whole_mut(),
+                false => buffers[place.buffer.index()].whole(),
+            };
+            if place.width > 0 {
+                for (block, rows) in blocks.iter_mut().zip(&chain.blocks) {
+                    block.push(rest.split_off(place.width * rows.len()));
+                }
+            } else {
+                let (last, others) = blocks.split_last_mut().expect("there is at least one");
+                others.iter_mut().for_each(|block| block.push(rest.again()));
+                last.push(rest);
+            }
+        }
+        let run = |(number, mut parts): (usize, Vec<Part<T>>)| {
+            for (step, link) in steps.iter().zip(&chain.links) {
+                dispatch(step, chain.blocks.get(number), &mut parts, link);
+            }
+        };
+        // One block stays in this thread: a product may then be split by the matrix library.
+        if blocks.len() == 1 {
+            run((0, blocks.swap_remove(0)));
+        } else {
+            blocks.into_par_iter().enumerate().for_each(run);
+        }
+        for (place, storage) in chain.places.iter().filter(|place| place.written).zip(taken) {
+            buffers[place.buffer.index()] = storage;
         }
     }
 }
@@ -128,14 +257,15 @@ impl<T: Real> Executor for CpuExecutor<T> {
     }
 
     fn run(&mut self, stage: StageId) -> Result<(), ExecutorError> {
-        for step in &self.plan.stages[stage.index()].steps {
-            Self::execute(&mut self.buffers, step);
+        for chain in &self.chains[stage.index()] {
+            Self::execute(&mut self.buffers, &self.plan.stages[stage.index()].steps[chain.steps.clone()], chain);
         }
         Ok(())
     }
 
     fn run_step(&mut self, stage: StageId, step: usize) -> Result<(), ExecutorError> {
-        Self::execute(&mut self.buffers, &self.plan.stages[stage.index()].steps[step]);
+        let step = std::slice::from_ref(&self.plan.stages[stage.index()].steps[step]);
+        Self::execute(&mut self.buffers, step, &Chain::of(step, split)[0]);
         Ok(())
     }
 
@@ -159,68 +289,110 @@ impl<T: Real> Executor for CpuExecutor<T> {
     }
 }
 
-/// Lists the references once: `op/direction` with the element types of inputs and outputs, in the order of the bindings.
+/// Outputs of a kernel, at most.
+const OUTPUTS: usize = 3;
+
+/// Lists the references once: `op/direction` with the element types of inputs and outputs, in the order of the bindings. Those of `rows`
+/// make each row from the same row of what they read; with the values of a row in each binding, 0 where all rows read the same.
 macro_rules! references {
-    ($($name:literal => $op:ident::$direction:ident($($input:ident)*) -> ($($output:ident)*);)*) => {
-        fn dispatch<T: Real>(step: &Step, inputs: &[&Storage<T>], outputs: &mut [Storage<T>]) {
-            let mut inputs = inputs.iter();
-            let mut outputs = outputs.iter_mut();
+    (
+        rows { $($row:literal => $row_op:ident::$row_direction:ident($($row_input:ident)*) -> ($($row_output:ident)*),
+            |$p:ident: $params:ty| $widths:expr;)* }
+        whole { $($name:literal => $op:ident::$direction:ident($($input:ident)*) -> ($($output:ident)*);)* }
+    ) => {
+        /// Runs a step on a block of rows, or as a whole.
+        fn dispatch<T: Real>(step: &Step, rows: Option<&Range<usize>>, parts: &mut [Part<T>], link: &Link) {
+            let mut outputs: [Part<T>; OUTPUTS] = Default::default();
+            for (output, &place) in outputs.iter_mut().zip(&link.outputs) {
+                *output = std::mem::take(&mut parts[place]);
+            }
+            let mut inputs = link.inputs.iter().map(|&place| &parts[place]);
+            let mut written = outputs.iter_mut();
             match step.kernel.name {
+                $($row => ops::$row_op::$row_direction(
+                    step.params::<$params>().block(rows.expect("these have blocks").clone()),
+                    $(inputs.next().expect("the builder checks the number of buffers").$row_input(),)*
+                    $(written.next().expect("the builder checks the number of buffers").$row_output(),)*
+                ),)*
                 $($name => ops::$op::$direction(
                     step.params(),
                     $(inputs.next().expect("the builder checks the number of buffers").$input(),)*
-                    $(outputs.next().expect("the builder checks the number of buffers").$output(),)*
+                    $(written.next().expect("the builder checks the number of buffers").$output(),)*
                 ),)*
                 other => unreachable!("`new` checks that {other} has a reference"),
+            }
+            for (output, &place) in outputs.into_iter().zip(&link.outputs) {
+                parts[place] = output;
+            }
+        }
+
+        /// How a step falls apart, if it does.
+        fn split(step: &Step) -> Option<Split> {
+            match step.kernel.name {
+                $($row => {
+                    let $p: $params = step.params();
+                    let widths: &[u32] = &$widths;
+                    let widths = widths.iter().map(|&width| width as usize).collect();
+                    Some(Split { rows: $p.rows(), rows_per_group: $p.rows_per_group(), widths })
+                })*
+                _ => None,
             }
         }
 
         /// The kernels that have a reference here.
-        pub(crate) const REFERENCES: &[&str] = &[$($name),*];
+        pub(crate) const REFERENCES: &[&str] = &[$($row,)* $($name),*];
     };
 }
 
 references! {
-    "pose/forward" => pose::forward(f) -> (f_mut);
-    "pose/backward" => pose::backward(f f) -> (f_mut);
-    "rays/forward" => rays::forward(f f f f) -> (f_mut f_mut);
-    "rays/backward" => rays::backward(f f f f f f) -> (f_mut);
-    "tile/gather" => tile::gather(f) -> (f_mut);
-    "tile/scatter" => tile::scatter(f) -> (f_mut);
-    "embedding/forward" => embedding::forward(f u) -> (f_mut);
-    "embedding/backward" => embedding::backward(u f) -> (f_mut);
-    "linear/forward" => linear::forward(f f u) -> (f_mut);
-    "linear/backward_input" => linear::backward_input(f f u) -> (f_mut);
-    "linear/backward_weight" => linear::backward_weight(f f) -> (f_mut);
-    "layer_norm_relu/forward" => layer_norm_relu::forward(f f) -> (f_mut f_mut);
-    "layer_norm_relu/backward_input" => layer_norm_relu::backward_input(f f f f) -> (f_mut);
-    "layer_norm_relu/backward_affine" => layer_norm_relu::backward_affine(f f f f) -> (f_mut);
-    "lstm_cell/forward" => lstm_cell::forward(f f) -> (f_mut f_mut);
-    "lstm_cell/backward" => lstm_cell::backward(f f f f f) -> (f_mut f_mut);
-    "advance/forward" => advance::forward(f f f) -> (f_mut);
-    "advance/backward" => advance::backward(f f f) -> (f_mut f_mut);
-    "density_sum/forward" => density_sum::forward(f f) -> (f_mut);
-    "density_sum/backward" => density_sum::backward(f f f) -> (f_mut f_mut);
-    "depth/forward" => depth::forward(f f) -> (f_mut);
-    "depth/backward" => depth::backward(f f) -> (f_mut);
-    "depth_loss/forward" => depth_loss::forward(f) -> (f_mut);
-    "latent_loss/forward" => latent_loss::forward(f) -> (f_mut);
-    "latent_loss/backward" => latent_loss::backward(f) -> (f_mut);
-    "image_loss/count" => image_loss::count(f) -> (f_mut);
-    "image_loss/forward" => image_loss::forward(f f f) -> (f_mut);
-    "image_loss/backward" => image_loss::backward(f f f) -> (f_mut);
-    "gmsd/pool" => gmsd::pool(f) -> (f_mut);
-    "gmsd/similarity" => gmsd::similarity(f f) -> (f_mut);
-    "gmsd/moments" => gmsd::moments(f) -> (f_mut);
-    "gmsd/deviation" => gmsd::deviation(f) -> (f_mut);
-    "gmsd/backward_similarity" => gmsd::backward_similarity(f f f f f) -> (f_mut);
-    "gmsd/backward_pool" => gmsd::backward_pool(f) -> (f_mut);
-    "adam/step" => adam::step(f f) -> (f_mut f_mut f_mut);
-    "sum/forward" => sum::forward(f) -> (f_mut);
-    "bfgs/equations" => bfgs::equations(f f f f f f f) -> (f_mut);
-    "bfgs/begin" => bfgs::begin(f f f) -> (f_mut);
-    "bfgs/gradient" => bfgs::gradient(f f) -> (f_mut);
-    "bfgs/update" => bfgs::update(f f f) -> (f_mut);
-    "bfgs/solve" => bfgs::solve() -> (f_mut f_mut);
-    "pack_rgba8/forward" => pack_rgba8::forward(f) -> (u_mut);
+    rows {
+        "rays/forward" => rays::forward(f f f f) -> (f_mut f_mut), |_p: RowsParams| [0, 0, 2, 1, 3, 3];
+        "linear/forward" => linear::forward(f f u) -> (f_mut), |p: LinearParams| [p.in_features, 0, 0, p.out_features];
+        "linear/backward_input" => linear::backward_input(f f u) -> (f_mut), |p: LinearParams| [p.out_features, 0, 0, p.in_features];
+        "layer_norm_relu/forward" => layer_norm_relu::forward(f f) -> (f_mut f_mut),
+            |p: LayerNormParams| [p.features, 0, p.features, 2];
+        "layer_norm_relu/backward_input" => layer_norm_relu::backward_input(f f f f) -> (f_mut),
+            |p: LayerNormParams| [p.features, 2, 0, p.features, p.features];
+        "lstm_cell/forward" => lstm_cell::forward(f f) -> (f_mut f_mut), |p: LstmParams| [4 * p.hidden, p.hidden, p.hidden, p.hidden];
+        "lstm_cell/backward" => lstm_cell::backward(f f f f f) -> (f_mut f_mut),
+            |p: LstmParams| [4 * p.hidden, p.hidden, p.hidden, p.hidden, p.hidden, 4 * p.hidden, p.hidden];
+        "advance/forward" => advance::forward(f f f) -> (f_mut), |_p: PointParams| [3, 3, 1, 3];
+        "advance/backward" => advance::backward(f f f) -> (f_mut f_mut), |_p: PointParams| [3, 1, 3, 1, 3];
+        "density_sum/forward" => density_sum::forward(f f) -> (f_mut), |p: PointParams| [1, p.features, p.features];
+        "density_sum/backward" => density_sum::backward(f f f) -> (f_mut f_mut),
+            |p: PointParams| [1, p.features, p.features, 1, p.features];
+        "depth/forward" => depth::forward(f f) -> (f_mut), |_p: RowsParams| [0, 3, 1];
+        "depth/backward" => depth::backward(f f) -> (f_mut), |_p: RowsParams| [0, 1, 3];
+        "image_loss/backward" => image_loss::backward(f f f) -> (f_mut), |_p: ImageLossParams| [3, 4, 0, 3];
+    }
+    whole {
+        "pose/forward" => pose::forward(f) -> (f_mut);
+        "pose/backward" => pose::backward(f f) -> (f_mut);
+        "rays/backward" => rays::backward(f f f f f f) -> (f_mut);
+        "tile/gather" => tile::gather(f) -> (f_mut);
+        "tile/scatter" => tile::scatter(f) -> (f_mut);
+        "embedding/forward" => embedding::forward(f u) -> (f_mut);
+        "embedding/backward" => embedding::backward(u f) -> (f_mut);
+        "linear/backward_weight" => linear::backward_weight(f f) -> (f_mut);
+        "layer_norm_relu/backward_affine" => layer_norm_relu::backward_affine(f f f f) -> (f_mut);
+        "depth_loss/forward" => depth_loss::forward(f) -> (f_mut);
+        "latent_loss/forward" => latent_loss::forward(f) -> (f_mut);
+        "latent_loss/backward" => latent_loss::backward(f) -> (f_mut);
+        "image_loss/count" => image_loss::count(f) -> (f_mut);
+        "image_loss/forward" => image_loss::forward(f f f) -> (f_mut);
+        "gmsd/pool" => gmsd::pool(f) -> (f_mut);
+        "gmsd/similarity" => gmsd::similarity(f f) -> (f_mut);
+        "gmsd/moments" => gmsd::moments(f) -> (f_mut);
+        "gmsd/deviation" => gmsd::deviation(f) -> (f_mut);
+        "gmsd/backward_similarity" => gmsd::backward_similarity(f f f f f) -> (f_mut);
+        "gmsd/backward_pool" => gmsd::backward_pool(f) -> (f_mut);
+        "adam/step" => adam::step(f f) -> (f_mut f_mut f_mut);
+        "sum/forward" => sum::forward(f) -> (f_mut);
+        "bfgs/equations" => bfgs::equations(f f f f f f f) -> (f_mut);
+        "bfgs/begin" => bfgs::begin(f f f) -> (f_mut);
+        "bfgs/gradient" => bfgs::gradient(f f) -> (f_mut);
+        "bfgs/update" => bfgs::update(f f f) -> (f_mut);
+        "bfgs/solve" => bfgs::solve() -> (f_mut f_mut);
+        "pack_rgba8/forward" => pack_rgba8::forward(f) -> (u_mut);
+    }
 }

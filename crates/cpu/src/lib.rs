@@ -4,10 +4,12 @@
 //! In `f64` it is the oracle that the WGSL kernels are tested against; in `f32`, threaded, it is the fallback for a machine
 //! without a GPU. The functions in [`ops`] take the parameter struct of the kernel and plain slices, inputs before outputs.
 
+mod chain;
 mod executor;
 pub mod ops;
 mod real;
 mod simd;
 
+pub use chain::rows_for_all_threads;
 pub use executor::CpuExecutor;
 pub use real::Real;

@@ -1,4 +1,4 @@
-//! Linear layers through a matrix library, rows in blocks that fit the cache, blocks in parallel.
+//! Linear layers through a matrix library.
 
 use gemm::{Parallelism, gemm};
 use rayon::prelude::*;
@@ -6,9 +6,6 @@ use srn_shaders::LinearParams;
 
 use super::chunk_of;
 use crate::Real;
-
-/// Rows of a block that one thread multiplies.
-const BLOCK_ROWS: usize = 256;
 
 /// A matrix as the library wants it: values and the distances between rows and between columns.
 struct Matrix<'a, T>(&'a [T], [usize; 2]);
@@ -51,25 +48,16 @@ fn weights_of<'a, T>(p: LinearParams, weights: &'a [T], slots: &[u32], group: us
     &weights[start..start + (p.out_features * p.in_features + p.out_features) as usize]
 }
 
-/// Calls `work(group, first row, block, threads)` for the blocks of all groups: blocks in parallel where there are several,
-/// else one block whose product the library may split.
-fn for_blocks<T: Send>(p: LinearParams, out: &mut [T], width: usize, work: impl Fn(usize, usize, &mut [T], Parallelism) + Sync) {
-    let rows = p.rows_per_group as usize;
-    let out = &mut out[..p.groups as usize * rows * width];
-    if p.groups == 1 && rows <= BLOCK_ROWS {
-        return work(0, 0, out, Parallelism::Rayon(0));
-    }
-    out.par_chunks_mut(rows * width).enumerate().for_each(|(group, out)| {
-        out.par_chunks_mut(BLOCK_ROWS * width).enumerate().for_each(|(block, out)| {
-            work(group, group * rows + block * BLOCK_ROWS, out, Parallelism::None);
-        });
-    });
+/// Within a block of rows that a thread of the pool works on, that thread alone; else the library may split the product.
+fn threads() -> Parallelism {
+    if rayon::current_thread_index().is_some() { Parallelism::None } else { Parallelism::Rayon(0) }
 }
 
 /// `y (+)= x Wᵀ + b`.
 pub fn forward<T: Real>(p: LinearParams, x: &[T], weights: &[T], slots: &[u32], y: &mut [T]) {
-    let [ins, outs] = [p.in_features as usize, p.out_features as usize];
-    for_blocks(p, y, outs, |group, first_row, y, threads| {
+    let [rows, ins, outs] = [p.rows_per_group, p.in_features, p.out_features].map(|size| size as usize);
+    let groups = y.chunks_exact_mut(rows * outs).zip(x.chunks_exact(rows * ins));
+    for (group, (y, x)) in groups.enumerate().take(p.groups as usize) {
         let (weight, bias) = weights_of(p, weights, slots, group).split_at(outs * ins);
         for y in y.chunks_exact_mut(outs) {
             if p.accumulate == 1 {
@@ -78,22 +66,20 @@ pub fn forward<T: Real>(p: LinearParams, x: &[T], weights: &[T], slots: &[u32], 
                 y.copy_from_slice(bias);
             }
         }
-        let rows = y.len() / outs;
-        let x = Matrix(&x[first_row * ins..(first_row + rows) * ins], [ins, 1]);
-        product([rows, outs, ins], y, x, Matrix(weight, [1, ins]), true, threads);
-    });
+        product([rows, outs, ins], y, Matrix(x, [ins, 1]), Matrix(weight, [1, ins]), true, threads());
+    }
 }
 
 /// `d_x (+)= d_y W`, over the outputs `first_out..end_out`.
 pub fn backward_input<T: Real>(p: LinearParams, d_y: &[T], weights: &[T], slots: &[u32], d_x: &mut [T]) {
-    let [ins, outs] = [p.in_features as usize, p.out_features as usize];
+    let [rows, ins, outs] = [p.rows_per_group, p.in_features, p.out_features].map(|size| size as usize);
     let [first, end] = [p.first_out as usize, p.end_out as usize];
-    for_blocks(p, d_x, ins, |group, first_row, d_x, threads| {
+    let groups = d_x.chunks_exact_mut(rows * ins).zip(d_y.chunks_exact(rows * outs));
+    for (group, (d_x, d_y)) in groups.enumerate().take(p.groups as usize) {
         let weight = &weights_of(p, weights, slots, group)[first * ins..end * ins];
-        let rows = d_x.len() / ins;
-        let d_y = Matrix(&d_y[first_row * outs + first..(first_row + rows) * outs], [outs, 1]);
-        product([rows, ins, end - first], d_x, d_y, Matrix(weight, [ins, 1]), p.accumulate == 1, threads);
-    });
+        let d_y = Matrix(&d_y[first..], [outs, 1]);
+        product([rows, ins, end - first], d_x, d_y, Matrix(weight, [ins, 1]), p.accumulate == 1, threads());
+    }
 }
 
 /// Per group and chunk of rows: `d_yᵀ x`, then the column sums of `d_y`.

@@ -2,7 +2,7 @@
 
 use srn_shaders::RowsParams;
 
-use super::{chunk_of, for_rows2};
+use super::chunk_of;
 use crate::Real;
 
 fn lift<T: Real>(intrinsics: &[T], uv: &[T]) -> [f64; 3] {
@@ -29,20 +29,17 @@ pub fn forward<T: Real>(
     origin: &mut [T],
     direction: &mut [T],
 ) {
-    let values = 3 * (p.groups * p.rows_per_group) as usize;
-    for_rows2((&mut origin[..values], 3), (&mut direction[..values], 3), |first, origin, direction| {
-        for (k, (origin, direction)) in origin.chunks_exact_mut(3).zip(direction.chunks_exact_mut(3)).enumerate() {
-            let row = first + k;
-            let image = p.first_group as usize + row / p.rows_per_group as usize;
-            let m = &world_from_camera[12 * image..12 * image + 12];
-            let world = rotate(m, lift(&intrinsics[4 * image..4 * image + 4], &uv[2 * row..2 * row + 2]));
-            let length = dot(world, world).sqrt();
-            for axis in 0..3 {
-                origin[axis] = T::of(m[4 * axis + 3].wide() + z0[row].wide() * world[axis]);
-                direction[axis] = T::of(world[axis] / length);
-            }
+    let rows = origin.chunks_exact_mut(3).zip(direction.chunks_exact_mut(3));
+    for (row, (origin, direction)) in rows.enumerate().take((p.groups * p.rows_per_group) as usize) {
+        let image = p.first_group as usize + row / p.rows_per_group as usize;
+        let m = &world_from_camera[12 * image..12 * image + 12];
+        let world = rotate(m, lift(&intrinsics[4 * image..4 * image + 4], &uv[2 * row..2 * row + 2]));
+        let length = dot(world, world).sqrt();
+        for axis in 0..3 {
+            origin[axis] = T::of(m[4 * axis + 3].wide() + z0[row].wide() * world[axis]);
+            direction[axis] = T::of(world[axis] / length);
         }
-    });
+    }
 }
 
 /// Per chunk of an image's rows: `d_R = Σ (z0 d_origin + d_(R q)) qᵀ`, `d_t = Σ d_origin`.

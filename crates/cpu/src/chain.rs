@@ -1,0 +1,176 @@
+//! Steps whose rows do not know each other run in chains: a thread takes a block of rows through all steps of a chain before it takes the
+//! next, so that what one step leaves is in the cache when the next one wants it.
+
+use std::ops::Range;
+
+use srn_plan::{BufferId, Step};
+use srn_shaders::{ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointParams, RowsParams};
+
+/// Rows of a block: what it reads and writes in a step should stay in a core's cache.
+const BLOCK_ROWS: usize = 256;
+/// The same for rows with more values than [`NARROW`], whose weights are large: packing them for a product must be worth it.
+const WIDE_BLOCK_ROWS: usize = 512;
+const NARROW: usize = 128;
+
+/// Rows that keep all threads busy.
+pub fn rows_for_all_threads() -> usize {
+    2 * WIDE_BLOCK_ROWS * rayon::current_num_threads()
+}
+
+/// Parameters of kernels that make each row of their outputs from the same row of their inputs.
+pub(crate) trait RowWise {
+    /// Rows of the step.
+    fn rows(&self) -> usize;
+
+    /// Rows that belong together, where it matters.
+    fn rows_per_group(&self) -> Option<usize> {
+        None
+    }
+
+    /// Parameters for a part of the rows, of one group.
+    fn block(self, rows: Range<usize>) -> Self;
+}
+
+macro_rules! plain_rows {
+    ($($params:ident)*) => {
+        $(impl RowWise for $params {
+            fn rows(&self) -> usize {
+                self.rows as usize
+            }
+
+            fn block(self, rows: Range<usize>) -> Self {
+                Self { rows: rows.len() as u32, ..self }
+            }
+        })*
+    };
+}
+
+plain_rows!(LayerNormParams LstmParams PointParams);
+
+macro_rules! rows_of_groups {
+    ($($params:ident)*) => {
+        $(impl RowWise for $params {
+            fn rows(&self) -> usize {
+                (self.groups * self.rows_per_group) as usize
+            }
+
+            fn rows_per_group(&self) -> Option<usize> {
+                Some(self.rows_per_group as usize)
+            }
+
+            fn block(self, rows: Range<usize>) -> Self {
+                let first_group = self.first_group + rows.start as u32 / self.rows_per_group;
+                Self { groups: 1, rows_per_group: rows.len() as u32, first_group, ..self }
+            }
+        })*
+    };
+}
+
+rows_of_groups!(ImageLossParams LinearParams RowsParams);
+
+/// How a step falls apart into rows.
+#[derive(Debug)]
+pub(crate) struct Split {
+    /// Number of rows.
+    pub rows: usize,
+    /// See [`RowWise::rows_per_group`].
+    pub rows_per_group: Option<usize>,
+    /// Values of a row in each binding; 0 where all rows read the same.
+    pub widths: Vec<usize>,
+}
+
+/// A buffer of a chain.
+#[derive(Debug)]
+pub(crate) struct Place {
+    pub buffer: BufferId,
+    /// Values of a row; 0 if every block gets the whole buffer.
+    pub width: usize,
+    pub written: bool,
+}
+
+/// A step of a chain; numbers are those of [`Chain::places`].
+#[derive(Debug)]
+pub(crate) struct Link {
+    pub inputs: Vec<usize>,
+    pub outputs: Vec<usize>,
+}
+
+/// Steps that run block by block; one step that does not fall apart is a chain with one block.
+#[derive(Debug)]
+pub(crate) struct Chain {
+    /// Numbers of the steps in their stage.
+    pub steps: Range<usize>,
+    pub links: Vec<Link>,
+    pub places: Vec<Place>,
+    /// Rows of each block, in order; none where the step is done as a whole.
+    pub blocks: Vec<Range<usize>>,
+    rows: usize,
+    rows_per_group: Option<usize>,
+}
+
+impl Chain {
+    /// Chains of all steps, in their order.
+    pub fn of(steps: &[Step], split: impl Fn(&Step) -> Option<Split>) -> Vec<Chain> {
+        let mut chains: Vec<Chain> = Vec::new();
+        for (number, step) in steps.iter().enumerate() {
+            let split = split(step);
+            let longer = split.as_ref().is_some_and(|split| chains.last_mut().is_some_and(|chain| chain.add(step, split)));
+            if !longer {
+                chains.push(Chain::begin(number, step, split));
+            }
+        }
+        chains.iter_mut().for_each(Chain::cut);
+        chains
+    }
+
+    fn begin(number: usize, step: &Step, split: Option<Split>) -> Chain {
+        let mut chain =
+            Chain { steps: number..number, links: vec![], places: vec![], blocks: vec![], rows: 0, rows_per_group: None };
+        let whole = Split { rows: 0, rows_per_group: None, widths: vec![0; step.buffers.len()] };
+        let split = split.unwrap_or(whole);
+        chain.rows = split.rows;
+        assert!(chain.add(step, &split), "the builder checks that outputs are no inputs");
+        chain
+    }
+
+    /// Takes the step in, unless its blocks would meddle with those of the others.
+    fn add(&mut self, step: &Step, split: &Split) -> bool {
+        let groups_agree = match (self.rows_per_group, split.rows_per_group) {
+            (Some(ours), Some(theirs)) => ours == theirs,
+            _ => true,
+        };
+        let bindings = || step.buffers.iter().zip(&split.widths).zip(step.kernel.bindings);
+        let fits = |((&buffer, &width), binding): ((&BufferId, &usize), &srn_shaders::Binding)| {
+            let known = self.places.iter().find(|place| place.buffer == buffer);
+            known.is_none_or(|known| known.width == width || !known.written && !binding.written)
+        };
+        if split.rows != self.rows || !groups_agree || !bindings().all(fits) {
+            return false;
+        }
+        let mut link = Link { inputs: vec![], outputs: vec![] };
+        for ((&buffer, &width), binding) in bindings() {
+            let is_it = |place: &Place| place.buffer == buffer && place.width == width;
+            let place = self.places.iter().position(is_it).unwrap_or_else(|| {
+                self.places.push(Place { buffer, width, written: false });
+                self.places.len() - 1
+            });
+            self.places[place].written |= binding.written;
+            if binding.written { &mut link.outputs } else { &mut link.inputs }.push(place);
+        }
+        self.links.push(link);
+        self.steps.end += 1;
+        self.rows_per_group = self.rows_per_group.or(split.rows_per_group);
+        true
+    }
+
+    /// Makes the blocks.
+    fn cut(&mut self) {
+        let group = self.rows_per_group.unwrap_or(self.rows);
+        let is_wide = self.places.iter().any(|place| place.width > NARROW);
+        let most = if is_wide { WIDE_BLOCK_ROWS } else { BLOCK_ROWS };
+        for first in (0..self.rows).step_by(group.max(1)) {
+            let end = first + group;
+            self.blocks.extend((first..end).step_by(most).map(|row| row..end.min(row + most)));
+        }
+    }
+}
