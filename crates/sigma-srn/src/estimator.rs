@@ -82,7 +82,7 @@ impl Options {
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents) = match effort {
             Effort::Fast => (84, [(6, 6), (6, 2), (8, 1)]),
-            Effort::Normal => (168, [(8, 16), (8, 6), (14, 3)]),
+            Effort::Normal => (84, [(8, 16), (8, 6), (14, 3)]),
             Effort::Exhaustive => (168, [(10, 64), (10, 20), (16, 6)]),
         };
         let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX }];

@@ -3,15 +3,13 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use glam::DMat4;
 use sigma_srn::Calibration;
 use sigma_srn::confidence::{Matrix6, fit, motion};
 
-use super::files::Picture;
 use super::notation::Notation;
-use super::search::{PoseError, SearchArgs, Starts};
-use super::views::{self, Views};
-use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
+use super::search::{On, PoseError, SearchArgs, Starts};
+use super::views;
+use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
 
 /// Where no search failed: the limit of what is unexplained, over the most that was.
 const MARGIN: f64 = 1.5;
@@ -74,31 +72,18 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     let mut model = load_model(&args.model)?;
     let (side, asked) = views::open(&model, &args.data, args.instances, args.views)?;
     refuse_existing([args.out.clone()], args.force)?;
-    let options = args.search.options()?;
     let engine = args.engine.open()?;
-    let steps: u64 = options.phases.iter().map(|phase| u64::from(phase.steps)).sum();
-    let bar = progress(steps * asked.len() as u64, "steps");
-    let mut known = Vec::new();
-    for (i, Views { name, pictures, truths, .. }) in asked.iter().enumerate() {
-        bar.set_message(name.clone());
-        let notation = Notation::default();
-        let starts = |(picture, truth): (&Picture, &DMat4)| {
-            args.search.starts(&args.starts, &model, picture, side, Some(truth), &notation)
-        };
-        let starts = pictures.iter().zip(truths).map(starts).collect::<Result<Vec<_>>>()?;
-        let found = args.search.run(&engine, &model, side, pictures, &starts, |progress| {
-            bar.set_position(i as u64 * steps + u64::from(progress.step));
-            Ok(())
-        })?;
-        known.extend(found.iter().zip(truths).map(|(found, truth)| Known {
-            rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
-            motion: motion(&found.world_from_camera, truth),
-            shape: found.estimate.shape(),
-            unexplained: found.unexplained,
-            rival: found.estimate.rival().map_or(f64::INFINITY, |(_, higher)| higher),
-        }));
-    }
-    bar.finish_and_clear();
+    let on = On { engine: &engine, model: &model, side };
+    let found = views::search(&asked, on, &args.search, &args.starts, &Notation::default(), |_, _| Ok(()))?;
+    let truths = asked.iter().flat_map(|views| &views.truths);
+    let known = found.iter().flatten().zip(truths).map(|(found, truth)| Known {
+        rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
+        motion: motion(&found.world_from_camera, truth),
+        shape: found.estimate.shape(),
+        unexplained: found.unexplained,
+        rival: found.estimate.rival().map_or(f64::INFINITY, |(_, higher)| higher),
+    });
+    let known: Vec<Known> = known.collect();
     let calibration = calibration(&known).ok_or("no search came near enough to the truth to learn from")?;
     model.metadata.calibration = Some(calibration);
     model.save(&args.out)?;

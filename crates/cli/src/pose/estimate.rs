@@ -9,11 +9,11 @@ use serde::Serialize;
 use sigma_srn::{Engine, Model, Pose6};
 use srn_data::camera::Axes;
 
-use super::files::{CameraArgs, Picture, PoseSource, create_dir, mask_of, model_side, srn_instance};
+use super::files::{ObjectArgs, Picture, PoseSource, create_dir, mask_of, model_side, srn_instance};
 use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
-use super::search::{Confidence, Found, PoseError, SearchArgs, Starts};
+use super::search::{Confidence, Found, On, PoseError, SearchArgs, Starts};
 use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
 
 /// Flags of `sigma-pose estimate`.
@@ -23,12 +23,8 @@ pub struct Estimate {
     /// around what transparency and --mask leave of it; with neither, to its middle. All are searched for in one batch.
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
-    /// Model, or checkpoint of a training run.
-    #[arg(long, value_name = "FILE")]
-    model: PathBuf,
-    /// Name or number of the object in the pictures. Default: the name of the SRN folder that a picture lies in.
-    #[arg(long, value_name = "NAME")]
-    instance: Option<String>,
+    #[command(flatten)]
+    object: ObjectArgs,
     /// An experiment. The object is none of the model's, but of their kind: a latent code is fitted to each picture together with the pose, beginning with
     /// those of the objects that look most alike.
     #[arg(long, conflicts_with_all = ["instance", "record"])]
@@ -36,8 +32,6 @@ pub struct Estimate {
     /// With --unseen and one picture: write the model with this object, for further pictures of it.
     #[arg(long, value_name = "FILE", requires = "unseen")]
     save_model: Option<PathBuf>,
-    #[command(flatten)]
-    camera: CameraArgs,
     /// What counts in a picture: white, or opaque. What is black (something before the object, a cluttered background) has no part in the
     /// search. A file, once or once per picture, or a folder with files called like the pictures.
     #[arg(long, value_name = "FILE|DIR")]
@@ -129,7 +123,7 @@ struct RankedReport {
 
 /// Runs the command; false where a pose is not to be trusted.
 pub fn run(args: &Estimate) -> Result<bool> {
-    let model = load_model(&args.model)?;
+    let model = load_model(&args.object.model)?;
     let side = model_side(&model, &args.images[0])?;
     let notation = args.poses.open()?;
     let rough = poses("--rough", &args.rough, &args.images, &notation)?;
@@ -155,13 +149,17 @@ pub fn run(args: &Estimate) -> Result<bool> {
         refuse_existing([path.clone()], args.force)?;
     }
     let engine = args.engine.open()?;
+    let on = On { engine: &engine, model: &model, side };
     if args.unseen {
-        return unseen(args, &engine, &model, side, &pictures, &starts, &sources, &notation);
+        let found = unseen(args, on, &pictures, &starts)?;
+        let names = vec!["unseen".to_string(); pictures.len()];
+        report(args, &engine, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
+        return Ok(found.iter().all(|found| found.trusted));
     }
 
     let bar = progress(options.phases.iter().map(|phase| u64::from(phase.steps)).sum(), "steps");
     let mut log = Log::default();
-    let found = args.search.run(&engine, &model, side, &pictures, &starts, |mut progress| {
+    let found = args.search.run(&options, on, &pictures, &starts, |mut progress| {
         bar.set_position(progress.step.into());
         if args.record.is_some() { log.note(&mut progress) } else { Ok(()) }
     })?;
@@ -171,8 +169,8 @@ pub fn run(args: &Estimate) -> Result<bool> {
     report(args, &engine, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
     if let Some(dir) = &args.record {
         for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
-            log.write(dir, i, picture, found, &engine, &model, side)?;
-            outline::write(dir, &args.images[i], picture, found, &engine, &model, side)?;
+            log.write(dir, i, picture, found, on)?;
+            outline::write(dir, &args.images[i], picture, found, on)?;
         }
         eprintln!("pictures in {}", dir.display());
     }
@@ -180,17 +178,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
 }
 
 /// Poses of objects that are not in the model.
-#[expect(clippy::too_many_arguments, reason = "what `run` has read")]
-fn unseen(
-    args: &Estimate,
-    engine: &Engine,
-    model: &Model,
-    side: u32,
-    pictures: &[Picture],
-    starts: &[Vec<DMat4>],
-    sources: &[Option<Notation>],
-    notation: &Notation,
-) -> Result<bool> {
+fn unseen(args: &Estimate, on: On, pictures: &[Picture], starts: &[Vec<DMat4>]) -> Result<Vec<Found>> {
     let mut found = Vec::new();
     let bar = progress(0, "turns");
     for (number, (picture, starts)) in pictures.iter().zip(starts).enumerate() {
@@ -199,16 +187,14 @@ fn unseen(
             bar.set_position((turns * number + turn) as u64);
             Ok(())
         };
-        let (one, fitted) = args.search.run_unseen(engine, model, side, picture, starts, observe)?;
+        let (one, fitted) = args.search.run_unseen(on, picture, starts, observe)?;
         if let Some(path) = &args.save_model {
             fitted.save(path)?;
         }
         found.push(one);
     }
     bar.finish_and_clear();
-    let names = vec!["unseen".to_string(); pictures.len()];
-    report(args, engine, &names, pictures, &found, sources).print(args, &found, notation)?;
-    Ok(found.iter().all(|found| found.trusted))
+    Ok(found)
 }
 
 /// One of `things` per image, of which there are none, one or as many.
@@ -231,8 +217,8 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
     let mut pictures = Vec::new();
     for ((path, mask), truth) in masks.into_iter().zip(truths) {
         let mask = mask.map(|mask| mask_of(mask, path)).transpose()?;
-        let instance = if args.unseen { Some("0") } else { args.instance.as_deref() };
-        let picture = Picture::open(path, mask.as_deref(), model, side, instance, &args.camera)?;
+        let instance = if args.unseen { Some("0") } else { args.object.instance.as_deref() };
+        let picture = Picture::open(path, mask.as_deref(), model, side, instance, &args.object.camera)?;
         let mut picture = Picture { truth, ..picture };
         while !names.insert(picture.name.clone()) {
             picture.name += "-again";

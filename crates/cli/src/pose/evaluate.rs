@@ -5,19 +5,19 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::{Engine, Model};
+use sigma_srn::Model;
 use srn_data::camera::Axes;
 use srn_data::sheet;
 
 use super::draw;
 use super::files::{Picture, create_dir, write_png};
 use super::notation::{Notation, NotationArgs};
-use super::search::{Confidence, Found, PoseError, SearchArgs, Starts};
+use super::search::{Confidence, Found, On, PoseError, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::tables;
 use super::views::{self, Views};
-use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
+use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
 
 /// Side of a view on the sheet, pixels.
 const SHOWN: u32 = 128;
@@ -124,38 +124,28 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     let model = load_model(&args.model)?;
     let (side, asked) = views::open(&model, &args.data, args.instances, args.views)?;
     let notation = args.poses.open()?;
-    // The starts are known before the first is searched for.
-    let mut queries = Vec::new();
-    for Views { name, dir, pictures, truths } in &asked {
-        let starts = |(picture, truth)| args.search.starts(&args.starts, &model, picture, side, Some(truth), &notation);
-        let starts = pictures.iter().zip(truths).map(starts).collect::<Result<Vec<_>>>()?;
-        queries.push((name, args.poses.source(Some(dir))?, pictures, truths, starts));
-    }
+    let sources = asked.iter().map(|views| args.poses.source(Some(&views.dir))).collect::<Result<Vec<_>>>()?;
     let files = ["results.json", "pictures.png"];
     if let Some(dir) = &args.out {
         refuse_existing(files.map(|file| dir.join(file)), args.force)?;
         create_dir(dir)?;
     }
-    let options = args.search.options()?;
     let engine = args.engine.open()?;
+    let on = On { engine: &engine, model: &model, side };
+    let found = views::search(&asked, on, &args.search, &args.starts, &notation, |_, _| Ok(()))?;
 
-    let steps: u64 = options.phases.iter().map(|phase| u64::from(phase.steps)).sum();
-    let bar = progress(steps * asked.len() as u64, "steps");
     let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();
-    for (i, (name, source, pictures, truths, starts)) in queries.iter().enumerate() {
-        bar.set_message(name.to_string());
-        let found = args.search.run(&engine, &model, side, pictures, starts, |progress| {
-            bar.set_position(i as u64 * steps + u64::from(progress.step));
-            Ok(())
-        })?;
-        let symmetries = args.symmetries_of(&engine, &model, side, pictures, truths)?;
-        let reports = pictures.iter().zip(*truths).zip(found);
-        for ((picture, truth), found) in reports {
-            let report = view_report(&model, name, picture, (truth, &symmetries), &found, notation.axes, source.as_ref());
-            results.push((report, picture, found));
+    for ((views, source), found) in asked.iter().zip(sources).zip(found) {
+        let symmetries = args.symmetries_of(on, views)?;
+        for ((picture, truth), found) in views.pictures.iter().zip(&views.truths).zip(found) {
+            let truth = (truth, &symmetries);
+            results.push((
+                view_report(&model, &views.name, picture, truth, &found, notation.axes, source.as_ref()),
+                picture,
+                found,
+            ));
         }
     }
-    bar.finish_and_clear();
 
     let sheet = args.out.as_ref().map(|_| pictures_sheet(&results, side, usize::MAX));
     let views: Vec<ViewReport> = results.into_iter().map(|(report, ..)| report).collect();
@@ -238,19 +228,12 @@ pub(super) fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u3
 }
 
 impl Evaluate {
-    /// Those of the instance in the pictures, if they count.
-    pub(super) fn symmetries_of(
-        &self,
-        engine: &Engine,
-        model: &Model,
-        side: u32,
-        pictures: &[Picture],
-        truths: &[DMat4],
-    ) -> Result<Symmetries> {
-        let (Some(picture), Some(truth), true) = (pictures.first(), truths.first(), self.symmetries) else {
+    /// Those of an instance, if they count.
+    pub(super) fn symmetries_of(&self, on: On, views: &Views) -> Result<Symmetries> {
+        let (Some(picture), Some(truth), true) = (views.pictures.first(), views.truths.first(), self.symmetries) else {
             return Ok(Symmetries::none());
         };
-        Symmetries::find(engine, model, picture.instance, side, picture.intrinsics, truth.w_axis.truncate().length())
+        Symmetries::find(on, picture.instance, picture.intrinsics, truth.w_axis.truncate().length())
     }
 }
 

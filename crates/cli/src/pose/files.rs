@@ -19,6 +19,19 @@ use crate::common::Result;
 /// longest side.
 const SPAN: f64 = 0.8;
 
+/// Flags that say what is looked for in pictures.
+#[derive(Args, Debug)]
+pub struct ObjectArgs {
+    /// Model, or checkpoint of a training run.
+    #[arg(long, value_name = "FILE")]
+    pub model: PathBuf,
+    /// Name or number of the object in the pictures. Default: the name of the SRN folder that a picture lies in.
+    #[arg(long, value_name = "NAME")]
+    pub instance: Option<String>,
+    #[command(flatten)]
+    pub camera: CameraArgs,
+}
+
 /// Flags that describe the camera; at most one of them.
 #[derive(Args, Clone, Debug)]
 #[group(multiple = false)]

@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use image::{Rgb, RgbImage};
-use sigma_srn::{Engine, Intrinsics, Model};
+use sigma_srn::Intrinsics;
 use srn_data::pixels::Pixels;
 use srn_data::sheet::{self, BLACK, Colour};
 
 use super::files::{Picture, write_png};
-use super::search::{Found, render};
+use super::search::{Found, On, render};
 use crate::common::Result;
 
 /// Colour of the line; its rim is black.
@@ -21,7 +21,8 @@ const WIDER: usize = 2;
 const LEAST_HEIGHT: u32 = 320;
 
 /// Writes `NAME-outline.png` of the picture at `path` to `dir`.
-pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, engine: &Engine, model: &Model, side: u32) -> Result<()> {
+pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, on: On) -> Result<()> {
+    let side = on.side;
     let (corner, extent) = picture.square;
     let times = extent.div_ceil(side as usize).clamp(1, FINEST) as u32;
     let (k, before) = (f64::from(times), 0.5 * (WIDER - 1) as f64 * f64::from(side));
@@ -30,7 +31,7 @@ pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, engine: 
     let [cx, cy] = [cx, cy].map(|c| k * (c + before + 0.5) - 0.5);
     let view_side = WIDER as u32 * times * side;
     let camera = Intrinsics { fx: k * fx, fy: k * fy, cx, cy, pixel_center };
-    let view = &render(engine, model, view_side, &[(picture.instance, found.world_from_camera, camera)])?[0];
+    let view = &render(On { side: view_side, ..on }, &[(picture.instance, found.world_from_camera, camera)])?[0];
     let silhouette = Silhouette::of(&view.rgb, view_side as usize);
 
     let photo = Pixels::open(path)?.to_rgb8();

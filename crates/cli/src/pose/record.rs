@@ -4,12 +4,12 @@ use std::path::Path;
 
 use glam::DMat4;
 use image::RgbImage;
-use sigma_srn::{Engine, Error, Model, Pose6, Progress};
+use sigma_srn::{Error, Pose6, Progress};
 use srn_data::sheet::{self, BLACK, CURVES, Colour, Curve};
 
 use super::draw;
 use super::files::{Picture, write_gif, write_png};
-use super::search::{Found, PoseError, render};
+use super::search::{Found, On, PoseError, render};
 use crate::common::Result;
 
 /// Side of a view on the pages, pixels.
@@ -59,24 +59,15 @@ impl Log {
     }
 
     /// Writes `NAME.png` and `NAME.gif` of picture number `index` to `dir`.
-    pub fn write(
-        &self,
-        dir: &Path,
-        index: usize,
-        picture: &Picture,
-        found: &Found,
-        engine: &Engine,
-        model: &Model,
-        side: u32,
-    ) -> Result<()> {
+    pub fn write(&self, dir: &Path, index: usize, picture: &Picture, found: &Found, on: On) -> Result<()> {
         let winner = found.estimate.ranking[0].start;
         let mut path = self.path(index, winner);
         let last = path.last().map_or(0, |point| point.step);
         path.push(Point { step: last, loss: found.estimate.loss, world_from_camera: found.world_from_camera });
         let chosen = frames(&path);
         let views: Vec<_> = chosen.iter().map(|&i| (picture.instance, path[i].world_from_camera, picture.intrinsics)).collect();
-        let renders = render(engine, model, side, &views)?;
-        let page = Page { log: self, index, picture, found, side, path: &path, chosen: &chosen };
+        let renders = render(on, &views)?;
+        let page = Page { log: self, index, picture, found, side: on.side, path: &path, chosen: &chosen };
         let rgb: Vec<&[f32]> = renders.iter().map(|render| &render.rgb[..]).collect();
         write_png(&dir.join(&picture.name).with_extension("png"), &page.sheet(&rgb))?;
         write_gif(&dir.join(&picture.name).with_extension("gif"), page.animation(&rgb))

@@ -13,7 +13,7 @@ use srn_data::srn::{self, InstanceWriter, read_pose};
 
 use super::files::{CameraArgs, write_gif, write_png};
 use super::notation::NotationArgs;
-use super::search::render;
+use super::search::{On, render};
 use super::{draw, positive};
 use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
 
@@ -110,7 +110,8 @@ pub fn run(args: &Render) -> Result<bool> {
             false => rgb8(&view.rgb, side as usize, side as usize),
         }
     };
-    let pictures: Vec<RgbImage> = render(&engine, &model, side, &views)?.iter().zip(&poses).map(draw).collect();
+    let pictures: Vec<RgbImage> =
+        render(On { engine: &engine, model: &model, side }, &views)?.iter().zip(&poses).map(draw).collect();
     match kind.as_str() {
         "png" => write_png(&args.out, &pictures[0])?,
         "gif" => write_gif(&args.out, pictures.into_iter().map(|picture| (picture, 0.08)))?,

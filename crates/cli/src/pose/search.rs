@@ -24,6 +24,14 @@ const ACCEPT: f64 = 0.25;
 /// Views that are rendered at once.
 const RENDER_BATCH: usize = 8;
 
+/// What views are rendered by: an executor and a model, for pictures of `side` × `side` pixels.
+#[derive(Clone, Copy)]
+pub struct On<'a> {
+    pub engine: &'a Engine,
+    pub model: &'a Model,
+    pub side: u32,
+}
+
 /// How poses are searched for: the same flags for a picture and for a data set.
 #[derive(Args, Clone, Debug)]
 #[command(next_help_heading = "Search")]
@@ -177,31 +185,16 @@ impl SearchArgs {
         Ok(Options { seed: self.seed, ..options })
     }
 
-    /// Estimates the poses of `pictures`, all of `side` pixels, each from its own starts.
+    /// Estimates the poses of `pictures`, each from its own starts. `options` are those of [`SearchArgs::options`], or others in their place.
     pub fn run(
         &self,
-        engine: &Engine,
-        model: &Model,
-        side: u32,
-        pictures: &[Picture],
-        starts: &[Vec<DMat4>],
-        observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
-    ) -> Result<Vec<Found>> {
-        self.run_with(&self.options()?, engine, model, side, pictures, starts, observe)
-    }
-
-    /// The same with other settings of the estimator.
-    #[expect(clippy::too_many_arguments, reason = "those of `run`, and one more")]
-    pub fn run_with(
-        &self,
         options: &Options,
-        engine: &Engine,
-        model: &Model,
-        side: u32,
+        on: On,
         pictures: &[Picture],
         starts: &[Vec<DMat4>],
         observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
     ) -> Result<Vec<Found>> {
+        let On { engine, model, side } = on;
         let queries: Vec<_> = pictures.iter().zip(starts).map(|(picture, starts)| query(picture, side, starts)).collect();
         let began = Instant::now();
         let estimates = estimate(engine, model, &queries, options, observe)?;
@@ -209,7 +202,7 @@ impl SearchArgs {
 
         let view = |(picture, found): (&Picture, &Estimate)| (picture.instance, found.pose.to_matrix(), picture.intrinsics);
         let views: Vec<View> = pictures.iter().zip(&estimates).map(view).collect();
-        let renders = render(engine, model, side, &views)?;
+        let renders = render(on, &views)?;
         let found = estimates.into_iter().zip(renders).zip(pictures);
         Ok(found.map(|((estimate, render), picture)| self.found(model, picture, estimate, render, seconds)).collect())
     }
@@ -217,18 +210,17 @@ impl SearchArgs {
     /// Estimates the pose of an object that the model was not trained on. The model with the object is returned too.
     pub fn run_unseen(
         &self,
-        engine: &Engine,
-        model: &Model,
-        side: u32,
+        on: On,
         picture: &Picture,
         starts: &[DMat4],
         observe: impl FnMut(usize, usize) -> std::result::Result<(), Error>,
     ) -> Result<(Found, Model)> {
+        let On { engine, model, side } = on;
         let began = Instant::now();
         let Unseen { estimate, model, .. } = estimate_unseen(engine, model, &query(picture, side, starts), self.seed, observe)?;
         let seconds = began.elapsed().as_secs_f64();
         let view = (0, estimate.pose.to_matrix(), picture.intrinsics);
-        let render = render(engine, &model, side, &[view])?.swap_remove(0);
+        let render = render(On { model: &model, ..on }, &[view])?.swap_remove(0);
         Ok((self.found(&model, picture, estimate, render, seconds), model))
     }
 
@@ -380,8 +372,8 @@ fn unexplained(picture: &Picture, render: &[f32]) -> f64 {
 /// Instance, `world_from_camera` and intrinsics of a view.
 pub type View = (u32, DMat4, Intrinsics);
 
-/// Renders views of `side` pixels, a few at a time.
-pub fn render(engine: &Engine, model: &Model, side: u32, views: &[View]) -> Result<Vec<Rendering>> {
+/// Renders views, a few at a time.
+pub fn render(On { engine, model, side }: On, views: &[View]) -> Result<Vec<Rendering>> {
     let batch = views.len().min(RENDER_BATCH);
     let mut renderer = Renderer::new(engine, model, batch as u32, side, side)?;
     let mut renders = Vec::new();

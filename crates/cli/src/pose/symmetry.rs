@@ -4,10 +4,10 @@ use std::f64::consts::TAU;
 
 use glam::{DMat3, DMat4, DVec3};
 use serde::Serialize;
+use sigma_srn::Intrinsics;
 use sigma_srn::camera::around84;
-use sigma_srn::{Engine, Intrinsics, Model};
 
-use super::search::{View, render};
+use super::search::{On, View, render};
 use crate::common::Result;
 
 /// Views that are compared.
@@ -33,16 +33,16 @@ impl Symmetries {
     }
 
     /// Those of an instance, found by comparing the model's own views from `radius` away.
-    pub fn find(engine: &Engine, model: &Model, instance: u32, side: u32, intrinsics: Intrinsics, radius: f64) -> Result<Self> {
+    pub fn find(on: On, instance: u32, intrinsics: Intrinsics, radius: f64) -> Result<Self> {
         // Small pictures show it as well.
-        let side = (side / 2).max(1);
+        let on = On { side: (on.side / 2).max(1), ..on };
         let Intrinsics { fx, fy, cx, cy, pixel_center } = intrinsics;
         let intrinsics = Intrinsics { fx: 0.5 * fx, fy: 0.5 * fy, cx: 0.5 * cx, cy: 0.5 * cy, pixel_center };
         let around = around84(radius);
         let cameras: Vec<DMat4> = (0..VIEWS).map(|k| around[k * around.len() / VIEWS]).collect();
         let seen = |turn: DMat4| -> Result<Vec<f32>> {
             let views: Vec<View> = cameras.iter().map(|camera| (instance, turn * *camera, intrinsics)).collect();
-            Ok(render(engine, model, side, &views)?.into_iter().flat_map(|view| view.rgb).collect())
+            Ok(render(on, &views)?.into_iter().flat_map(|view| view.rgb).collect())
         };
         let sum = |values: &mut dyn Iterator<Item = f32>| values.map(|value| f64::from(value.abs())).sum::<f64>();
         let plain = seen(DMat4::IDENTITY)?;

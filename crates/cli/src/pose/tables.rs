@@ -3,7 +3,6 @@
 use std::path::Path;
 use std::time::Instant;
 
-use glam::DMat4;
 use sigma_srn::{Engine, Loss, Model};
 use srn_data::camera::Axes;
 use srn_data::sheet::{self, CURVES, Curve};
@@ -12,7 +11,7 @@ use srn_data::{Dataset, Instance};
 use super::evaluate::{Evaluate, ViewReport, pictures_sheet, view_report};
 use super::files::{Picture, create_dir, write_png};
 use super::notation::Notation;
-use super::search::{Found, LOSSES, PoseError, Preset, SearchArgs, Starts};
+use super::search::{Found, LOSSES, On, PoseError, Preset, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::views::{self, Views, spread};
@@ -155,6 +154,24 @@ fn two_shot(engine: &Engine, args: &Evaluate, model: &Model, mut set: Dataset, s
     Ok((model, unseen.collect()))
 }
 
+/// Searches for views of objects that the model does not know, each for itself.
+fn one_shot(on: On, asked: &[Views], search: &SearchArgs, starts: &Starts) -> Result<Vec<Vec<Found>>> {
+    let bar = progress(asked.iter().map(|views| views.pictures.len() as u64).sum(), "views");
+    let mut all = Vec::new();
+    for Views { name, pictures, truths, .. } in asked {
+        bar.set_message(name.clone());
+        let mut found = Vec::new();
+        for (picture, truth) in pictures.iter().zip(truths) {
+            let starts = search.starts(starts, on.model, picture, on.side, Some(truth), &Notation::default())?;
+            found.push(search.run_unseen(on, picture, &starts, |_, _| Ok(()))?.0);
+            bar.inc(1);
+        }
+        all.push(found);
+    }
+    bar.finish_and_clear();
+    Ok(all)
+}
+
 /// As many of the views, each instance's and each place's turn after the other.
 fn few(asked: &[Views], count: Option<u32>) -> Vec<Views> {
     let count = count.map_or(usize::MAX, |count| count as usize);
@@ -186,57 +203,53 @@ impl Bench<'_> {
     ) -> Result<Vec<(ViewReport, Picture, Found)>> {
         let preset = setting.preset.unwrap_or(Preset::Default);
         let search: SearchArgs = self.args.search.with(preset, setting.loss.map(|(_, loss)| loss))?;
-        let steps: u64 = search.options()?.phases.iter().map(|phase| u64::from(phase.steps)).sum();
-        let bar = progress(steps * asked.len() as u64, "steps");
-        let (mut results, mut moments) = (Vec::new(), Vec::<Moment>::new());
-        for (i, Views { name, pictures, truths, .. }) in asked.iter().enumerate() {
-            bar.set_message(format!("{} {} {name}", setting.preset(), setting.starts));
-            let notation = Notation::default();
-            let starts = |(picture, truth): (&Picture, &DMat4)| {
-                search.starts(&setting.starts, model, picture, side, Some(truth), &notation)
-            };
-            let starts = pictures.iter().zip(truths).map(starts).collect::<Result<Vec<_>>>()?;
+        let on = On { engine: &self.engine, model, side };
+        let notation = Notation::default();
+        let mut symmetries = Vec::new();
+        for views in asked {
             // Found once: the same for all presets. Of an unknown object the model can show no views.
-            let symmetries = match self.symmetries.iter().find(|known| (known.0, &known.1) == (setting.table == 2, name)) {
+            let is_it = |known: &&(bool, String, Symmetries)| (known.0, &known.1) == (setting.table == 2, &views.name);
+            symmetries.push(match self.symmetries.iter().find(is_it) {
                 _ if setting.preset.is_none() => Symmetries::none(),
                 Some((.., symmetries)) => symmetries.clone(),
                 None => {
-                    let found = self.args.symmetries_of(&self.engine, model, side, pictures, truths)?;
-                    self.symmetries.push((setting.table == 2, name.clone(), found.clone()));
+                    let found = self.args.symmetries_of(on, views)?;
+                    self.symmetries.push((setting.table == 2, views.name.clone(), found.clone()));
                     found
                 }
-            };
-            let error = |pose: &DMat4, truth: &DMat4| PoseError::of(pose, &symmetries.nearest(truth, pose)).rotation_deg;
-            let (began, mut number) = (Instant::now(), 0);
-            if setting.preset.is_none() {
-                for ((picture, truth), starts) in pictures.iter().zip(truths).zip(&starts) {
-                    let (found, _) = search.run_unseen(&self.engine, model, side, picture, starts, |_, _| Ok(()))?;
-                    let report = view_report(model, name, picture, (truth, &symmetries), &found, Axes::OpenCv, None);
-                    results.push((report, picture.clone(), found));
+            });
+        }
+        let mut moments = Vec::<Moment>::new();
+        let found = if setting.preset.is_none() {
+            one_shot(on, asked, &search, &setting.starts)?
+        } else {
+            let (mut running, mut began, mut number) = (usize::MAX, Instant::now(), 0);
+            views::search(asked, on, &search, &setting.starts, &notation, |i, progress| {
+                if i != running {
+                    (running, began, number) = (i, Instant::now(), 0);
                 }
-                continue;
-            }
-            let found = search.run(&self.engine, model, side, pictures, &starts, |progress| {
-                bar.set_position(i as u64 * steps + u64::from(progress.step));
                 let standing = progress.descent.standing()?;
                 if moments.len() == number {
                     moments.push(Moment { step: progress.step, ..Moment::default() });
                 }
-                for (query, truth) in truths.iter().enumerate() {
+                for (query, truth) in asked[i].truths.iter().enumerate() {
                     let own = standing.iter().zip(progress.hypotheses).filter(|(_, name)| name.0 == query);
                     let best = own.min_by(|(a, _), (b, _)| a.0.total_cmp(&b.0)).expect("every query has a hypothesis");
-                    moments[number].errors.push(error(&best.0.1.to_matrix(), truth));
+                    let pose = best.0.1.to_matrix();
+                    moments[number].errors.push(PoseError::of(&pose, &symmetries[i].nearest(truth, &pose)).rotation_deg);
                 }
                 moments[number].seconds += began.elapsed().as_secs_f64();
                 number += 1;
                 Ok(())
-            })?;
+            })?
+        };
+        let mut results = Vec::new();
+        for ((Views { name, pictures, truths, .. }, symmetries), found) in asked.iter().zip(&symmetries).zip(found) {
             for ((picture, truth), found) in pictures.iter().zip(truths).zip(found) {
-                let report = view_report(model, name, picture, (truth, &symmetries), &found, Axes::OpenCv, None);
+                let report = view_report(model, name, picture, (truth, symmetries), &found, Axes::OpenCv, None);
                 results.push((report, picture.clone(), found));
             }
         }
-        bar.finish_and_clear();
         moments.iter_mut().for_each(|moment| moment.seconds /= moment.errors.len() as f64);
         let views: Vec<ViewReport> = results.iter().map(|(report, ..)| report.clone()).collect();
         let summary = Summary::of("", &views.iter().collect::<Vec<_>>());
@@ -355,6 +368,7 @@ impl Bench<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::DMat4;
     use sigma_srn::Intrinsics;
 
     #[test]

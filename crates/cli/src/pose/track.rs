@@ -8,9 +8,9 @@ use serde::Serialize;
 use sigma_srn::{Options, Phase, Pose6};
 
 use super::draw;
-use super::files::{CameraArgs, Picture, PoseSource, mask_of, model_side, write_gif};
+use super::files::{ObjectArgs, Picture, PoseSource, mask_of, model_side, write_gif};
 use super::notation::NotationArgs;
-use super::search::{Confidence, Found, PoseError, SearchArgs, Starts};
+use super::search::{Confidence, Found, On, PoseError, SearchArgs, Starts};
 use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
 
 /// Side of a frame in the animation, pixels.
@@ -24,14 +24,8 @@ pub struct Track {
     /// Frames in order, as `estimate` takes them; or a folder, whose pictures are taken by name.
     #[arg(required = true, value_name = "FRAME|DIR")]
     frames: Vec<PathBuf>,
-    /// Model, or checkpoint of a training run.
-    #[arg(long, value_name = "FILE")]
-    model: PathBuf,
-    /// Name or number of the object. Default: the name of the SRN folder that a frame lies in.
-    #[arg(long, value_name = "NAME")]
-    instance: Option<String>,
     #[command(flatten)]
-    camera: CameraArgs,
+    object: ObjectArgs,
     /// Folder with masks called like the frames; see `estimate`.
     #[arg(long, value_name = "DIR")]
     mask: Option<PathBuf>,
@@ -77,7 +71,7 @@ struct FrameReport<'a> {
 
 /// Runs the command; false where the last pose is not to be trusted.
 pub fn run(args: &Track) -> Result<bool> {
-    let model = load_model(&args.model)?;
+    let model = load_model(&args.object.model)?;
     let frames = frames(&args.frames)?;
     let side = model_side(&model, &frames[0])?;
     let notation = args.poses.open()?;
@@ -85,6 +79,7 @@ pub fn run(args: &Track) -> Result<bool> {
         refuse_existing([path.clone()], args.force)?;
     }
     let engine = args.engine.open()?;
+    let on = On { engine: &engine, model: &model, side };
     let all_around = args.search.options()?;
     // The next pose is near; what would have to be found from afar is searched for all around instead.
     let phase = |steps, stride, keep| Phase { steps, stride, keep };
@@ -97,13 +92,12 @@ pub fn run(args: &Track) -> Result<bool> {
     let (mut errors, mut searches, mut trusted) = (Vec::new(), 0, true);
     for (number, path) in frames.iter().enumerate() {
         let mask = args.mask.as_ref().map(|mask| mask_of(mask, path)).transpose()?;
-        let picture = Picture::open(path, mask.as_deref(), &model, side, args.instance.as_deref(), &args.camera)?;
+        let picture = Picture::open(path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
         if let (0, Some(rough)) = (number, &args.rough) {
             before = vec![rough.read(path, &notation)?];
         }
         let run = |options: &Options, starts: Vec<DMat4>| -> Result<Found> {
-            let found =
-                args.search.run_with(options, &engine, &model, side, std::slice::from_ref(&picture), &[starts], |_| Ok(()));
+            let found = args.search.run(options, on, std::slice::from_ref(&picture), &[starts], |_| Ok(()));
             Ok(found?.swap_remove(0))
         };
         let followed = match before[..] {

@@ -3,12 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use glam::DMat4;
-use sigma_srn::{Intrinsics, Model};
+use sigma_srn::{Error, Intrinsics, Model, Progress};
 use srn_data::LoadedView;
 use srn_data::srn::SrnSet;
 
 use super::files::{Picture, model_side};
-use crate::common::{Result, camera};
+use super::notation::Notation;
+use super::search::{Found, On, SearchArgs, Starts};
+use crate::common::{Result, camera, progress};
 
 /// Views of one instance.
 pub struct Views {
@@ -49,6 +51,37 @@ pub fn open(model: &Model, data: &Path, instances: u32, views: u32) -> Result<(u
         all.push(Views { name: files.name.clone(), dir: files.dir.clone(), pictures, truths });
     }
     Ok((side, all))
+}
+
+/// Searches for all views, instance by instance, with a bar on stderr. `observe` also gets the number of the instance. Returns what was found
+/// for the views of each.
+pub fn search(
+    asked: &[Views],
+    on: On,
+    args: &SearchArgs,
+    starts: &Starts,
+    notation: &Notation,
+    mut observe: impl FnMut(usize, Progress) -> std::result::Result<(), Error>,
+) -> Result<Vec<Vec<Found>>> {
+    let options = args.options()?;
+    // All starts are known before the first is searched for.
+    let mut all_starts = Vec::new();
+    for Views { pictures, truths, .. } in asked {
+        let of = |(picture, truth)| args.starts(starts, on.model, picture, on.side, Some(truth), notation);
+        all_starts.push(pictures.iter().zip(truths).map(of).collect::<Result<Vec<_>>>()?);
+    }
+    let steps: u64 = options.phases.iter().map(|phase| u64::from(phase.steps)).sum();
+    let bar = progress(steps * asked.len() as u64, "steps");
+    let mut found = Vec::new();
+    for (i, (Views { name, pictures, .. }, starts)) in asked.iter().zip(&all_starts).enumerate() {
+        bar.set_message(name.clone());
+        found.push(args.run(&options, on, pictures, starts, |progress| {
+            bar.set_position(i as u64 * steps + u64::from(progress.step));
+            observe(i, progress)
+        })?);
+    }
+    bar.finish_and_clear();
+    Ok(found)
 }
 
 /// A view as a picture that is searched for, and its true pose.
