@@ -4,7 +4,7 @@
 
 use srn_cpu::CpuExecutor;
 use srn_gpu::{Choice, Gpu, GpuExecutor, wgpu};
-use srn_plan::{ExecutorError, Kernel, Rows};
+use srn_plan::{Executor, ExecutorError, Kernel, Rows};
 use srn_shaders::{Requirement, TABLE, Variant};
 use srn_tests::{Case, Divergence, gpu, lockstep};
 
@@ -99,19 +99,24 @@ const ROWS: [Rows; 5] = [
 ];
 
 impl KernelTest {
-    /// Runs every case on every variant; only the steps of this kernel run on the device, on inputs that the reference computed.
+    /// Runs every case on every variant, and on the CPU in `f32`; only the steps of this kernel run there, on inputs that the reference
+    /// computed.
     fn matches_reference(&self) {
         let mut worst = 0.0f64;
+        for case in (self.cases)() {
+            let mut executor = CpuExecutor::<f32>::new(case.plan.clone(), u64::MAX).expect("every kernel has a reference");
+            self.worst(&case, &mut executor).unwrap_or_else(|what| panic!("{} on the CPU: {what}", case.name));
+        }
         for variant in self.kernel.variants {
             let gpu = gpu().with_choice(Choice::Named(variant.name.into()));
             let mut ran = false;
             for case in (self.cases)() {
-                let executor =
+                let mut executor =
                     GpuExecutor::new(&gpu, case.plan.clone(), u64::MAX).unwrap_or_else(|error| panic!("{}: {error}", case.name));
                 // Other cases run the plain form, which has its own turn.
                 if self.runs(&case, &executor, variant) {
                     ran = true;
-                    worst = worst.max(self.worst(&case, executor).unwrap_or_else(|what| panic!("{}: {what}", case.name)));
+                    worst = worst.max(self.worst(&case, &mut executor).unwrap_or_else(|what| panic!("{}: {what}", case.name)));
                 }
             }
             assert!(ran || !can_run(variant), "no case runs {}", variant.name);
@@ -128,12 +133,12 @@ impl KernelTest {
             .any(|(index, _)| executor.label(case.stage, index) == label)
     }
 
-    fn worst(&self, case: &Case, mut executor: GpuExecutor) -> Result<f64, Divergence> {
+    fn worst(&self, case: &Case, executor: &mut dyn Executor) -> Result<f64, Divergence> {
         let mut reference = CpuExecutor::<f64>::new(case.plan.clone(), u64::MAX).expect("every kernel has a reference");
         case.fill(&mut reference).expect("filling the reference");
-        case.fill(&mut executor).expect("filling the device");
+        case.fill(executor).expect("filling the device");
         let tolerance = |kernel: &Kernel| (kernel.name == self.kernel.name).then_some(self.tolerance);
-        let worst = lockstep(&mut executor, &mut reference, case.stage, tolerance)?;
+        let worst = lockstep(executor, &mut reference, case.stage, tolerance)?;
         Ok(worst[self.kernel.name])
     }
 
@@ -151,7 +156,7 @@ impl KernelTest {
     fn catches(&self, fault: &Fault) -> Result<bool, ExecutorError> {
         let gpu = self.faulty_gpu(fault);
         for case in (self.cases)() {
-            if self.worst(&case, GpuExecutor::new(&gpu, case.plan.clone(), u64::MAX)?).is_err() {
+            if self.worst(&case, &mut GpuExecutor::new(&gpu, case.plan.clone(), u64::MAX)?).is_err() {
                 return Ok(true);
             }
         }

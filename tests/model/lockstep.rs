@@ -70,6 +70,46 @@ fn a_step_of_every_descent() {
     }
 }
 
+#[test]
+fn a_chain_on_the_cpu_gives_what_its_steps_give() {
+    let engine = Engine::cpu();
+    let trained = || {
+        let mut trainer = trainer(&engine, model(true), Train::Everything, 3);
+        trainer.step(&batch(3), 1e-3).unwrap();
+        trainer
+    };
+    let [mut chained, mut stepped] = [trained(), trained()];
+    same_in_steps(chained.executor(), stepped.executor());
+    for method in methods() {
+        let evaluated = || {
+            let mut descent = descent(&engine, method, 3);
+            descent.evaluate().unwrap();
+            descent.descend().unwrap();
+            descent
+        };
+        let [mut chained, mut stepped] = [evaluated(), evaluated()];
+        same_in_steps(chained.executor(), stepped.executor());
+    }
+}
+
+/// Runs every stage, on one executor as a whole and on the other step by step, and compares all buffers bit by bit.
+fn same_in_steps(chained: &mut dyn Executor, stepped: &mut dyn Executor) {
+    let plan = chained.plan().clone();
+    for (number, stage) in plan.stages.iter().enumerate() {
+        let id = plan.stage_id(number);
+        chained.run(id).unwrap();
+        for step in 0..stage.steps.len() {
+            stepped.run_step(id, step).unwrap();
+        }
+        for buffer in plan.buffers.iter().filter(|buffer| buffer.element == srn_plan::Element::F32) {
+            let id = plan.find(&buffer.name).unwrap();
+            let [got, want] = [chained.read(id), stepped.read(id)].map(|values| values.unwrap());
+            let same = got.iter().zip(&want).all(|(got, want)| got.to_bits() == want.to_bits());
+            assert!(same, "stage {}: `{}` differs", stage.name, buffer.name);
+        }
+    }
+}
+
 /// After the same calls the inputs are the same up to rounding: now to the last digit.
 pub fn share_inputs(subject: &mut dyn Executor, reference: &mut dyn Executor) {
     let plan = subject.plan().clone();

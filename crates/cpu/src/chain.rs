@@ -163,14 +163,24 @@ impl Chain {
         true
     }
 
-    /// Makes the blocks.
+    /// Makes the blocks: as large as they may be, or smaller ones where some threads would wait for the others.
     fn cut(&mut self) {
-        let group = self.rows_per_group.unwrap_or(self.rows);
         let is_wide = self.places.iter().any(|place| place.width > NARROW);
         let most = if is_wide { WIDE_BLOCK_ROWS } else { BLOCK_ROWS };
-        for first in (0..self.rows).step_by(group.max(1)) {
-            let end = first + group;
-            self.blocks.extend((first..end).step_by(most).map(|row| row..end.min(row + most)));
+        let threads = rayon::current_num_threads();
+        for most in [most, most / 2, most / 4] {
+            self.blocks = self.blocks_of(most);
+            let rounds = self.blocks.len().div_ceil(threads);
+            if rounds * threads <= self.blocks.len() + self.blocks.len() / 8 {
+                break;
+            }
         }
+    }
+
+    /// Blocks of at most so many rows, all of one group.
+    fn blocks_of(&self, most: usize) -> Vec<Range<usize>> {
+        let group = self.rows_per_group.unwrap_or(self.rows).max(1);
+        let of_group = |first: usize| (first..first + group).step_by(most).map(move |row| row..(first + group).min(row + most));
+        (0..self.rows).step_by(group).flat_map(of_group).collect()
     }
 }

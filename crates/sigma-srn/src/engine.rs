@@ -116,8 +116,9 @@ impl Engine {
     ) -> Result<(Plan, T), Error> {
         let preferred = self.tile_rows.unwrap_or(match &self.kind {
             Kind::Gpu(gpu) if !gpu.adapter().is_software => GPU_TILE_ROWS,
-            Kind::Gpu(_) => CPU_TILE_VALUES / features.max(1),
-            Kind::Cpu | Kind::CpuF64 => (CPU_TILE_VALUES / features.max(1)).max(srn_cpu::rows_for_all_threads() as u32),
+            Kind::Gpu(_) | Kind::Cpu | Kind::CpuF64 => {
+                (CPU_TILE_VALUES / features.max(1)).max(srn_cpu::rows_for_all_threads() as u32)
+            }
         });
         let mut tile_rows = rows.min(preferred).max(1);
         loop {
