@@ -48,14 +48,15 @@ macro_rules! plain_rows {
 plain_rows!(LayerNormParams LstmParams PointParams);
 
 macro_rules! rows_of_groups {
-    ($($params:ident)*) => {
+    ($($params:ident: $groups_matter:expr,)*) => {
         $(impl RowWise for $params {
             fn rows(&self) -> usize {
                 (self.groups * self.rows_per_group) as usize
             }
 
             fn rows_per_group(&self) -> Option<usize> {
-                Some(self.rows_per_group as usize)
+                let groups_matter: fn(&Self) -> bool = $groups_matter;
+                groups_matter(self).then_some(self.rows_per_group as usize)
             }
 
             fn block(self, rows: Range<usize>) -> Self {
@@ -66,7 +67,12 @@ macro_rules! rows_of_groups {
     };
 }
 
-rows_of_groups!(ImageLossParams LinearParams RowsParams);
+rows_of_groups! {
+    ImageLossParams: |_| true,
+    // Else all groups share their weights.
+    LinearParams: |p| p.weight_stride > 0,
+    RowsParams: |_| true,
+}
 
 /// How a step falls apart into rows.
 #[derive(Debug)]
@@ -141,8 +147,8 @@ impl Chain {
         };
         let bindings = || step.buffers.iter().zip(&split.widths).zip(step.kernel.bindings);
         let fits = |((&buffer, &width), binding): ((&BufferId, &usize), &srn_shaders::Binding)| {
-            let known = self.places.iter().find(|place| place.buffer == buffer);
-            known.is_none_or(|known| known.width == width || !known.written && !binding.written)
+            let mut known = self.places.iter().filter(|place| place.buffer == buffer);
+            known.all(|known| known.width == width || !known.written && !binding.written)
         };
         if split.rows != self.rows || !groups_agree || !bindings().all(fits) {
             return false;
@@ -163,24 +169,12 @@ impl Chain {
         true
     }
 
-    /// Makes the blocks: as large as they may be, or smaller ones where some threads would wait for the others.
+    /// Makes the blocks, each of rows of one group.
     fn cut(&mut self) {
+        let group = self.rows_per_group.unwrap_or(self.rows).max(1);
         let is_wide = self.places.iter().any(|place| place.width > NARROW);
         let most = if is_wide { WIDE_BLOCK_ROWS } else { BLOCK_ROWS };
-        let threads = rayon::current_num_threads();
-        for most in [most, most / 2, most / 4] {
-            self.blocks = self.blocks_of(most);
-            let rounds = self.blocks.len().div_ceil(threads);
-            if rounds * threads <= self.blocks.len() + self.blocks.len() / 8 {
-                break;
-            }
-        }
-    }
-
-    /// Blocks of at most so many rows, all of one group.
-    fn blocks_of(&self, most: usize) -> Vec<Range<usize>> {
-        let group = self.rows_per_group.unwrap_or(self.rows).max(1);
         let of_group = |first: usize| (first..first + group).step_by(most).map(move |row| row..(first + group).min(row + most));
-        (0..self.rows).step_by(group).flat_map(of_group).collect()
+        self.blocks = (0..self.rows).step_by(group).flat_map(of_group).collect();
     }
 }

@@ -121,6 +121,15 @@ pub(crate) fn sigmoid<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
     simd.div_f32s(one, simd.add_f32s(one, exponential(simd, simd.neg_f32s(x))))
 }
 
+/// Coefficients of `(tanh x - x) / x³` in `x²` (Cephes), the highest power first.
+const TANH: [f32; 5] = [
+    -5.704_988_727_455_282e-3_f64 as f32,
+    2.063_908_879_545_3e-2_f64 as f32,
+    -5.373_971_297_310_02e-2_f64 as f32,
+    1.333_144_197_585_25e-1_f64 as f32,
+    -3.333_328_194_227_63e-1_f64 as f32,
+];
+
 /// `tanh x`: a polynomial near zero (Cephes), where the quotient of exponentials would cancel.
 #[inline(always)]
 pub(crate) fn hyperbolic_tangent<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
@@ -128,8 +137,7 @@ pub(crate) fn hyperbolic_tangent<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
     let e = exponential(simd, simd.add_f32s(x, x));
     let far = simd.sub_f32s(one, simd.div_f32s(two, simd.add_f32s(e, one)));
     let square = simd.mul_f32s(x, x);
-    let coefficients = [-5.704_988_7e-3, 2.063_909e-2, -5.373_971_4e-2, 1.333_144_2e-1, -3.333_328_3e-1];
-    let near = simd.mul_add_e_f32s(simd.mul_f32s(x, square), polynomial(simd, square, coefficients), x);
+    let near = simd.mul_add_e_f32s(simd.mul_f32s(x, square), polynomial(simd, square, TANH), x);
     simd.select_f32s(simd.less_than_f32s(simd.abs_f32s(x), simd.splat_f32s(0.625)), near, far)
 }
 
