@@ -48,15 +48,14 @@ macro_rules! plain_rows {
 plain_rows!(LayerNormParams LstmParams PointParams);
 
 macro_rules! rows_of_groups {
-    ($($params:ident: $groups_matter:expr,)*) => {
+    ($($params:ident)*) => {
         $(impl RowWise for $params {
             fn rows(&self) -> usize {
                 (self.groups * self.rows_per_group) as usize
             }
 
             fn rows_per_group(&self) -> Option<usize> {
-                let groups_matter: fn(&Self) -> bool = $groups_matter;
-                groups_matter(self).then_some(self.rows_per_group as usize)
+                Some(self.rows_per_group as usize)
             }
 
             fn block(self, rows: Range<usize>) -> Self {
@@ -67,12 +66,7 @@ macro_rules! rows_of_groups {
     };
 }
 
-rows_of_groups! {
-    ImageLossParams: |_| true,
-    // Else all groups share their weights.
-    LinearParams: |p| p.weight_stride > 0,
-    RowsParams: |_| true,
-}
+rows_of_groups!(ImageLossParams LinearParams RowsParams);
 
 /// How a step falls apart into rows.
 #[derive(Debug)]

@@ -10,8 +10,8 @@ use crate::model::Model;
 use crate::random::{initial_depths, stream};
 use crate::{Error, Rays, pixel_grid};
 
-/// How far starts are turned that the search adds, about as far as it finds back.
-const TURN: f64 = 30.0 * std::f64::consts::PI / 180.0;
+/// How far starts are turned that the search adds. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
+const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
 
 /// An image whose camera pose is wanted.
 #[derive(Clone, Debug)]
@@ -49,7 +49,7 @@ pub struct Phase {
 pub struct Options {
     /// How hypotheses move.
     pub method: Method,
-    /// Where an image has fewer starts than this, six more are tried around each, turned by 30° about the object: to either side about each
+    /// Where an image has fewer starts than this, six more are tried around each, turned by 40° about the object: to either side about each
     /// axis of the camera.
     pub min_starts: usize,
     /// Phases, one after the other.
@@ -264,7 +264,7 @@ pub fn estimate(
     Ok(estimates)
 }
 
-/// A camera turned about the object by 30°, to either side about each of its axes.
+/// A camera turned about the object by 40°, to either side about each of its axes.
 fn turned(world_from_camera: &DMat4) -> impl Iterator<Item = DMat4> {
     let axes = [world_from_camera.x_axis, world_from_camera.y_axis, world_from_camera.z_axis];
     let turns =
