@@ -377,15 +377,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn added_starts_are_30_degrees_away_on_the_same_sphere() {
+    fn added_starts_are_40_degrees_away_on_the_same_sphere() {
         let start = crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
         let added: Vec<DMat4> = turned(&start).collect();
         assert_eq!(added.len(), 6);
         for (k, pose) in added.iter().enumerate() {
             let (degrees, _) = crate::camera::pose_error(pose, &start);
             let [near, far] = [&start, pose].map(|pose| pose.w_axis.truncate().length());
-            assert!((degrees - 30.0).abs() < 1e-6 && (near - far).abs() < 1e-12, "{k}: {degrees}°");
+            assert!((degrees - 40.0).abs() < 1e-6 && (near - far).abs() < 1e-12, "{k}: {degrees}°");
             assert!(added[..k].iter().all(|other| crate::camera::pose_error(pose, other).0 > 40.0), "{k}");
+        }
+    }
+
+    #[test]
+    fn no_added_start_is_the_pose_that_others_were_turned_away_from() {
+        let truth = crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
+        for start in crate::camera::neighbor4(&truth).iter().flat_map(turned) {
+            let (degrees, _) = crate::camera::pose_error(&start, &truth);
+            assert!(degrees > 5.0, "{degrees}°");
         }
     }
 
