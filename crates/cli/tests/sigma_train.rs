@@ -125,6 +125,30 @@ fn a_killed_run_resumes_to_the_same_bits_on_the_gpu() {
     killed_and_resumed("gpu");
 }
 
+#[test]
+fn a_run_begins_with_the_networks_of_another_model() {
+    let dir = tempfile::tempdir().unwrap();
+    let [first, second] = ["first", "second"].map(|name| dir.path().join(name));
+    succeed(&format!("fit --data {TRAIN} --validation {TEST} --out {} {TINY} --steps 60 --executor cpu", first.display()));
+    let (_, unsized_flags) = TINY.split_once("--side").unwrap();
+    let from = |what: &str| {
+        let second = second.display();
+        format!("fit --from {what} --data {TEST} --out {second} --side {unsized_flags} --steps 10 --executor cpu")
+    };
+    let model = first.join("model.safetensors").display().to_string();
+    fail(&from(&dir.path().join("none.safetensors").display().to_string()), &["none.safetensors"]);
+    fail(&format!("{} --hidden 16", from(&model)), &["--from", "--hidden"]);
+    succeed(&from(&model));
+    let loss = |run: &Path, step: usize| metrics(run)[step]["loss"].as_f64().unwrap();
+    assert!(loss(&second, 0) < 0.5 * loss(&first, 0), "{} after {}", loss(&second, 0), loss(&first, 0));
+    let config: Value = serde_json::from_slice(&fs::read(second.join("config.json")).unwrap()).unwrap();
+    assert_eq!((&config["hidden"], &config["latent"], &config["tracing_steps"]), (&16.into(), &8.into(), &3.into()));
+    // The other model is not needed any more.
+    fs::remove_dir_all(&first).unwrap();
+    succeed(&format!("fit --resume {} --steps 12", second.display()));
+    assert_eq!(metrics(&second).len(), 12);
+}
+
 #[cfg(unix)]
 #[test]
 fn ctrl_c_saves_and_says_how_to_go_on() {

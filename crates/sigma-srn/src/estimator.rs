@@ -82,8 +82,8 @@ impl Options {
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents) = match effort {
             Effort::Fast => (84, [(6, 6), (6, 2), (8, 1)]),
-            Effort::Normal => (84, [(8, 16), (8, 6), (14, 3)]),
-            Effort::Exhaustive => (168, [(10, 64), (10, 20), (16, 6)]),
+            Effort::Normal => (84, [(8, 16), (8, 6), (22, 3)]),
+            Effort::Exhaustive => (168, [(10, 64), (10, 20), (24, 6)]),
         };
         let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX }];
         phases.extend([4, 2, 1].into_iter().zip(descents).map(|(stride, (steps, keep))| Phase { steps, stride, keep }));

@@ -21,7 +21,7 @@ use sigma_srn::{Engine, Losses, Metadata, Model, Random, Train, Trainer, stream,
 use srn_data::{Dataset, SrnSet, pixels, sheet};
 
 use super::{Changeable, ForGood, Settings, Shown, psnr_of_each, render, training_batch};
-use crate::common::{self, EngineArgs, Result};
+use crate::common::{self, EngineArgs, Result, load_model};
 
 /// Time between checkpoints.
 const CHECKPOINT_INTERVAL: Duration = Duration::from_secs(60);
@@ -77,14 +77,18 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     let engine = if is_resumed { args.engine.open_like(&settings.executor, settings.memory)? } else { args.engine.open()? };
     (settings.executor, settings.memory) = (engine.to_string(), engine.budget());
 
-    let mut model = Model::init(&settings.model(), settings.seed)?;
-    let instance_names = set.instances.iter().map(|instance| instance.name.clone()).collect();
+    let instance_names: Vec<String> = set.instances.iter().map(|instance| instance.name.clone()).collect();
+    let checkpoint = run.join("checkpoint.safetensors");
+    // A run that was killed before its first checkpoint begins again.
+    let has_checkpoint = is_resumed && checkpoint.exists();
+    let mut model = match settings.from.clone() {
+        Some(from) => begin_with(if has_checkpoint { &checkpoint } else { &from }, &mut settings, &instance_names)?,
+        None => Model::init(&settings.model(), settings.seed)?,
+    };
     let orbit_radius = median_distance(&set);
     model.metadata = Metadata { instance_names, side: Some(settings.side), orbit_radius: Some(orbit_radius), calibration: None };
     let mut trainer = Trainer::new(&engine, model, Train::Everything, settings.batch, settings.rays)?;
-    let checkpoint = run.join("checkpoint.safetensors");
-    // A run that was killed before its first checkpoint begins again.
-    if is_resumed && checkpoint.exists() {
+    if has_checkpoint {
         trainer.load_checkpoint(&checkpoint)?;
     }
     if trainer.steps() > settings.steps {
@@ -164,6 +168,17 @@ fn load(dir: &Path, side: u32, views: Option<usize>) -> Result<Dataset> {
         instance.views.truncate(views.unwrap_or(usize::MAX));
     }
     Ok(set.load(side as usize)?)
+}
+
+/// The networks of a trained model with new codes, and its sizes in the settings.
+fn begin_with(path: &Path, settings: &mut Settings, instance_names: &[String]) -> Result<Model> {
+    let of_file = |error| common::about_model(path, error);
+    let model = load_model(path)?.with_new_instances(instance_names.to_vec()).map_err(of_file)?;
+    settings.hidden = model.layout.features();
+    settings.latent = model.hypernetwork().map_err(of_file)?.latent;
+    settings.tracing_steps = model.layout.tracing_steps;
+    settings.density = model.layout.density.is_some();
+    Ok(model)
 }
 
 /// Random instances, and of each a random view.

@@ -19,6 +19,9 @@ pub struct Settings {
     pub validation: Option<PathBuf>,
     /// Name and number of views of each instance, so that a resumed run notices another set.
     pub instances: BTreeMap<String, usize>,
+    /// The model whose networks this one began with; sizes are its own.
+    #[serde(default)]
+    pub from: Option<PathBuf>,
     /// Features of the networks.
     pub hidden: u32,
     /// Length of a latent code.
@@ -68,6 +71,8 @@ pub enum Preset {
     /// Trains in under two hours on two CPU cores: small networks, random rays.
     #[default]
     Compact,
+    /// Twice as wide, for sets of many or fine objects: each step takes about three times as long.
+    Base,
     /// The paper's: 256 features, batches of 10 whole images at 5e-5, at most 50 views of an instance.
     Paper,
 }
@@ -79,10 +84,14 @@ pub struct ForGood {
     /// Starting point for all numbers.
     #[arg(long, value_enum)]
     preset: Option<Preset>,
-    /// Features of the networks [compact 64, paper 256].
+    /// Begin with the networks of this trained model, whatever it was trained on, and with the mean of its codes: fewer steps will do. Sizes
+    /// are the model's.
+    #[arg(long, value_name = "MODEL", conflicts_with_all = ["hidden", "latent", "tracing_steps", "plain_srn"])]
+    from: Option<PathBuf>,
+    /// Features of the networks [compact 64, base 128, paper 256].
     #[arg(long, value_name = "N", value_parser = up_to(4096))]
     hidden: Option<u32>,
-    /// Length of a latent code [compact 32, paper 256].
+    /// Length of a latent code [compact 32, base 64, paper 256].
     #[arg(long, value_name = "N", value_parser = up_to(4096))]
     latent: Option<u32>,
     /// Marching steps along a ray [10].
@@ -94,16 +103,16 @@ pub struct ForGood {
     /// Images are cut to squares and resampled to this side, in pixels [64].
     #[arg(long, value_name = "PIXELS", value_parser = up_to(4096))]
     side: Option<u32>,
-    /// Use only the first views of each instance, this many [compact all, paper 50].
+    /// Use only the first views of each instance, this many [all, paper 50].
     #[arg(long, value_name = "N", value_parser = up_to(u32::MAX))]
     views: Option<u32>,
-    /// Images per step [compact 20, paper 10].
+    /// Images per step [20, paper 10].
     #[arg(long, value_name = "N", value_parser = up_to(100000))]
     batch: Option<u32>,
-    /// Random rays per image; side² takes whole images [compact 256, paper side²].
+    /// Random rays per image; side² takes whole images [256, paper side²].
     #[arg(long, value_name = "N", value_parser = up_to(u32::MAX))]
     rays: Option<u32>,
-    /// Part of the random rays drawn where a picture is not of one colour; the others fall anywhere [compact 0.5, paper 0].
+    /// Part of the random rays drawn where a picture is not of one colour; the others fall anywhere [0.5, paper 0].
     #[arg(long, value_name = "PART", value_parser = part)]
     detail: Option<f64>,
     /// Decides the first weights and every draw [0].
@@ -132,13 +141,13 @@ pub struct Changeable {
     /// Unseen views of the same instances, for validation. Without it, training views are looked at.
     #[arg(long, value_name = "DIR")]
     validation: Option<PathBuf>,
-    /// Number of steps [compact 14000, paper 100000].
+    /// Number of steps [14000, paper 100000].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     steps: Option<u64>,
-    /// Learning rate of Adam [compact 5e-4, paper 5e-5].
+    /// Learning rate of Adam [5e-4, paper 5e-5].
     #[arg(long, value_name = "RATE", value_parser = positive)]
     lr: Option<f64>,
-    /// Factor on the learning rate in the last part [compact 0.1, paper 1].
+    /// Factor on the learning rate in the last part [0.1, paper 1].
     #[arg(long, value_name = "FACTOR", value_parser = positive)]
     decay: Option<f64>,
     /// The last step at the full learning rate [4/5 of the steps; a resumed run keeps it].
@@ -174,13 +183,20 @@ macro_rules! take {
 impl Settings {
     /// Settings of a new run: the preset's, with the flags over them. The data set and the executor are not looked at yet.
     pub fn new(for_good: &ForGood, changeable: &Changeable) -> Result<Self> {
-        let is_paper = for_good.preset == Some(Preset::Paper);
+        let preset = for_good.preset.unwrap_or_default();
+        let is_paper = preset == Preset::Paper;
+        let (hidden, latent) = match preset {
+            Preset::Compact => (64, 32),
+            Preset::Base => (128, 64),
+            Preset::Paper => (256, 256),
+        };
         let mut settings = Settings {
             data: PathBuf::new(),
             validation: None,
             instances: BTreeMap::new(),
-            hidden: if is_paper { 256 } else { 64 },
-            latent: if is_paper { 256 } else { 32 },
+            from: for_good.from.clone(),
+            hidden,
+            latent,
             tracing_steps: 10,
             density: !for_good.plain_srn,
             side: 64,
