@@ -1,6 +1,7 @@
 //! Steps whose rows do not know each other run in chains: a thread takes a block of rows through all steps of a chain before it takes the
 //! next, so that what one step leaves is in the cache when the next one wants it.
 
+use std::cell::Cell;
 use std::ops::Range;
 
 use srn_plan::{BufferId, Step};
@@ -15,6 +16,22 @@ const NARROW: usize = 128;
 /// Rows that keep all threads busy.
 pub fn rows_for_all_threads() -> usize {
     2 * WIDE_BLOCK_ROWS * rayon::current_num_threads()
+}
+
+thread_local! {
+    static ALONE: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Works on one of many blocks, while other threads work on others.
+pub(crate) fn alone(work: impl FnOnce()) {
+    ALONE.set(true);
+    work();
+    ALONE.set(false);
+}
+
+/// Whether this thread works on one of many blocks.
+pub(crate) fn is_alone() -> bool {
+    ALONE.get()
 }
 
 /// Parameters of kernels that make each row of their outputs from the same row of their inputs.

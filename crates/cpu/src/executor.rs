@@ -5,7 +5,7 @@ use srn_plan::{BufferId, Element, Executor, ExecutorError, Plan, StageId, Step};
 use srn_shaders::{ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointParams, RowsParams};
 
 use crate::chain::{Chain, Link, RowWise, Split};
-use crate::{Real, ops};
+use crate::{Real, chain, ops};
 
 /// The values of one buffer.
 #[derive(Clone, Debug)]
@@ -217,11 +217,11 @@ impl<T: Real> CpuExecutor<T> {
                 dispatch(step, chain.blocks.get(number), &mut parts, link);
             }
         };
-        // One block stays in this thread: a product may then be split by the matrix library.
+        // In a single block, a product may be split by the matrix library.
         if blocks.len() == 1 {
             run((0, blocks.swap_remove(0)));
         } else {
-            blocks.into_par_iter().enumerate().for_each(run);
+            blocks.into_par_iter().enumerate().for_each(|block| chain::alone(|| run(block)));
         }
         for (place, storage) in chain.places.iter().filter(|place| place.written).zip(taken) {
             buffers[place.buffer.index()] = storage;
@@ -257,9 +257,13 @@ impl<T: Real> Executor for CpuExecutor<T> {
     }
 
     fn run(&mut self, stage: StageId) -> Result<(), ExecutorError> {
-        for chain in &self.chains[stage.index()] {
-            Self::execute(&mut self.buffers, &self.plan.stages[stage.index()].steps[chain.steps.clone()], chain);
-        }
+        let (chains, steps, buffers) = (&self.chains[stage.index()], &self.plan.stages[stage.index()].steps, &mut self.buffers);
+        // In a thread of the pool: one outside would fall asleep and be woken for each chain, and so would the pool.
+        rayon::scope(|_| {
+            for chain in chains {
+                Self::execute(buffers, &steps[chain.steps.clone()], chain);
+            }
+        });
         Ok(())
     }
 

@@ -6,6 +6,8 @@ use srn_shaders::LinearParams;
 
 use super::chunk_of;
 use crate::Real;
+use crate::chain::is_alone;
+use crate::simd::vectorised;
 
 /// A matrix as the library wants it: values and the distances between rows and between columns.
 struct Matrix<'a, T>(&'a [T], [usize; 2]);
@@ -48,9 +50,9 @@ fn weights_of<'a, T>(p: LinearParams, weights: &'a [T], slots: &[u32], group: us
     &weights[start..start + (p.out_features * p.in_features + p.out_features) as usize]
 }
 
-/// Within a block of rows that a thread of the pool works on, that thread alone; else the library may split the product.
+/// Within one of many blocks of rows, the thread that works on it; else the library may split the product.
 fn threads() -> Parallelism {
-    if rayon::current_thread_index().is_some() { Parallelism::None } else { Parallelism::Rayon(0) }
+    if is_alone() { Parallelism::None } else { Parallelism::Rayon(0) }
 }
 
 /// `y (+)= x Wᵀ + b`.
@@ -98,9 +100,7 @@ pub fn backward_weight<T: Real>(p: LinearParams, x: &[T], d_y: &[T], partial: &m
         let size = [outs, ins, rows.len()];
         product(size, d_weight, Matrix(d_y, [1, outs]), Matrix(x, [ins, 1]), p.accumulate == 1, threads);
         let mut sums = vec![0.0; outs];
-        for d_y in d_y.chunks_exact(outs) {
-            sums.iter_mut().zip(d_y).for_each(|(sum, d)| *sum += d.wide());
-        }
+        add_rows(d_y, &mut sums);
         for (d_bias, sum) in d_bias.iter_mut().zip(sums) {
             *d_bias = T::of(sum + if p.accumulate == 1 { d_bias.wide() } else { 0.0 });
         }
@@ -110,4 +110,15 @@ pub fn backward_weight<T: Real>(p: LinearParams, x: &[T], d_y: &[T], partial: &m
         return work(0, partial, Parallelism::Rayon(0));
     }
     partial.par_chunks_mut(parameters).enumerate().for_each(|(part, out)| work(part, out, Parallelism::None));
+}
+
+vectorised! {
+    /// Adds each row to `sums`.
+    fn add_rows<T: Real>(rows: &[T], sums: &mut [f64]) {
+        for row in rows.chunks_exact(sums.len()) {
+            for (sum, value) in sums.iter_mut().zip(row) {
+                *sum += value.wide();
+            }
+        }
+    }
 }
