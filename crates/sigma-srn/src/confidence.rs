@@ -1,6 +1,8 @@
 //! How sure an estimate is. The second derivatives `B` of the loss say how a pose error shows in the picture, and so in which
 //! directions it can hide. The renderer does not know the object exactly; how far off that leaves the poses, only known ones can tell.
 
+use std::collections::BTreeMap;
+
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
@@ -13,7 +15,7 @@ pub type Matrix6 = [[f64; 6]; 6];
 pub type Known = ([f64; 6], Matrix6);
 
 /// What estimates of known poses told of a model.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// The covariance of an estimate is this times `loss · B⁻¹`,
     pub curvature: f64,
@@ -21,10 +23,24 @@ pub struct Calibration {
     pub floor: [f64; 6],
     /// Part of a picture that an estimate to be trusted leaves unexplained at most.
     pub unexplained: f64,
+    /// By instance, the part of a picture that the true pose leaves unexplained: the median. The network knows one object better than another.
+    #[serde(default)]
+    pub usual: BTreeMap<String, f64>,
+    /// How many times what is `usual` for its instance an estimate to be trusted leaves unexplained at most.
+    #[serde(default)]
+    pub above_usual: f64,
     /// How much higher, as a part, the loss must be at the next best pose elsewhere for an estimate to be trusted.
     pub rival: f64,
     /// Number of estimates that this is from.
     pub views: u32,
+}
+
+impl Calibration {
+    /// Whether an estimate of this instance is to be trusted, by what it leaves unexplained and by its rival, if there is one.
+    pub fn trusts(&self, instance: &str, unexplained: f64, rival_higher: Option<f64>) -> bool {
+        let is_usual = self.usual.get(instance).is_none_or(|usual| unexplained <= self.above_usual * usual);
+        unexplained <= self.unexplained && is_usual && rival_higher.is_none_or(|higher| higher >= self.rival)
+    }
 }
 
 /// What the squared distance of six normal numbers from their mean, in units of their covariance, is below in 95 % of all cases.
@@ -101,7 +117,8 @@ pub fn fit(known: &[Known]) -> Option<(f64, [f64; 6])> {
     squared.sort_by(f64::total_cmp);
     // The next one is as likely to lie anywhere between these: below the rank that 95 % of n + 1 are.
     let rank = (0.95 * (count + 1.0)).ceil() as usize;
-    let factor = squared[rank.min(squared.len()) - 1] / WITHIN_95;
+    // The view of that rank itself lies within, however the ellipsoid is rounded.
+    let factor = (1.0 + 1e-9) * squared[rank.min(squared.len()) - 1] / WITHIN_95;
     Some((factor * a * whole, squares.map(|square| factor * b * square)))
 }
 
@@ -180,7 +197,7 @@ mod tests {
     }
 
     fn calibration(curvature: f64, floor: [f64; 6]) -> Calibration {
-        Calibration { curvature, floor, unexplained: 1.0, rival: 0.0, views: 1 }
+        Calibration { curvature, floor, unexplained: 1.0, usual: BTreeMap::new(), above_usual: 0.0, rival: 0.0, views: 1 }
     }
 
     #[test]

@@ -488,7 +488,7 @@ impl Model {
         if let Some(radius) = self.metadata.orbit_radius {
             text.insert("orbit_radius".into(), radius.to_string());
         }
-        if let Some(calibration) = self.metadata.calibration {
+        if let Some(calibration) = &self.metadata.calibration {
             text.insert("calibration".into(), serde_json::json!(calibration).to_string());
         }
         text

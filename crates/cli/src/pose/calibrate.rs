@@ -1,5 +1,6 @@
 //! `sigma-pose calibrate`: what a model's estimates are worth, from views with known poses.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -7,12 +8,16 @@ use sigma_srn::Calibration;
 use sigma_srn::confidence::{Matrix6, fit, motion};
 
 use super::notation::Notation;
-use super::search::{On, PoseError, SearchArgs, Starts};
-use super::views;
-use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
+use super::search::{On, PoseError, SearchArgs, Starts, View, render, unexplained};
+use super::summary::Statistics;
+use super::views::{self, Views, spread};
+use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
 
-/// Where no search failed: the limit of what is unexplained, over the most that was.
+/// Where no search failed: the limits of what is unexplained, over the most that was.
 const MARGIN: f64 = 1.5;
+
+/// Values of each limit that are tried, at most.
+const CANDIDATES: usize = 64;
 
 /// Flags of `sigma-pose calibrate`.
 #[derive(Args, Debug)]
@@ -57,6 +62,8 @@ struct Known {
     /// See `Estimate::shape`.
     shape: Option<Matrix6>,
     unexplained: f64,
+    /// The same, over what is usual for the instance; 0 where that is not known.
+    over_usual: f64,
     /// Infinite without a rival.
     rival: f64,
 }
@@ -70,35 +77,43 @@ impl Known {
 /// Runs the command.
 pub fn run(args: &Calibrate) -> Result<bool> {
     let mut model = load_model(&args.model)?;
-    let (side, asked) = views::open(&model, &args.data, args.instances, args.views)?;
+    let (side, all) = views::open(&model, &args.data, u32::MAX, u32::MAX)?;
     refuse_existing([args.out.clone()], args.force)?;
     let engine = args.engine.open()?;
     let on = On { engine: &engine, model: &model, side };
+    let usual = usual(on, &all)?;
+    let mut asked = spread(all, args.instances as usize);
+    for Views { pictures, truths, .. } in &mut asked {
+        *pictures = spread(std::mem::take(pictures), args.views as usize);
+        *truths = spread(std::mem::take(truths), args.views as usize);
+    }
     let found = views::search(&asked, on, &args.search, &args.starts, &Notation::default(), |_, _| Ok(()))?;
-    let truths = asked.iter().flat_map(|views| &views.truths);
-    let known = found.iter().flatten().zip(truths).map(|(found, truth)| Known {
-        rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
-        motion: motion(&found.world_from_camera, truth),
-        shape: found.estimate.shape(),
-        unexplained: found.unexplained,
-        rival: found.estimate.rival().map_or(f64::INFINITY, |(_, higher)| higher),
-    });
-    let known: Vec<Known> = known.collect();
-    let calibration = calibration(&known).ok_or("no search came near enough to the truth to learn from")?;
-    model.metadata.calibration = Some(calibration);
+    let mut known = Vec::new();
+    for (Views { name, truths, .. }, found) in asked.iter().zip(&found) {
+        known.extend(found.iter().zip(truths).map(|(found, truth)| Known {
+            rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
+            motion: motion(&found.world_from_camera, truth),
+            shape: found.estimate.shape(),
+            unexplained: found.unexplained,
+            over_usual: usual.get(name).map_or(0.0, |usual| found.unexplained / usual),
+            rival: found.estimate.rival().map_or(f64::INFINITY, |(_, higher)| higher),
+        }));
+    }
+    let calibration = calibration(&known, usual).ok_or("no search came near enough to the truth to learn from")?;
+    model.metadata.calibration = Some(calibration.clone());
     model.save(&args.out)?;
     if args.json {
         print(&serde_json::to_string_pretty(&calibration)?)?;
     } else {
         let failures = known.iter().filter(|known| known.has_failed()).count();
-        let Calibration { curvature, floor, unexplained, rival, views } = calibration;
+        let Calibration { curvature, floor, unexplained, above_usual, rival, views, .. } = calibration;
         print(&format!("{views} views, {failures} of them more than {}° off", PoseError::FAILURE_DEG))?;
         print(&format!("covariance: {curvature:.2e} × loss × inverse of its second derivatives"))?;
         let [a, b, c] = [0, 1, 2].map(|k| floor[k].sqrt().to_degrees());
         let [x, y, z] = [3, 4, 5].map(|k| floor[k].sqrt());
         print(&format!("and in all views ± {a:.2}° {b:.2}° {c:.2}° about the camera's axes, ± {x:.4} {y:.4} {z:.4} along them"))?;
         print(&format!(
-            "trusted: at most {:.1} % unexplained, and a loss {:.1} % higher elsewhere",
+            "trusted: at most {:.1} % unexplained, {above_usual:.1} times what is usual for the object, and a loss {:.1} % higher elsewhere",
             100.0 * unexplained,
             100.0 * rival
         ))?;
@@ -107,42 +122,85 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     Ok(true)
 }
 
+/// The part of a picture that its true pose leaves unexplained, the median of each instance.
+fn usual(on: On, all: &[Views]) -> Result<BTreeMap<String, f64>> {
+    let bar = progress(all.len() as u64, "instances");
+    let mut usual = BTreeMap::new();
+    for Views { name, pictures, truths, .. } in all {
+        let at_truth: Vec<View> =
+            pictures.iter().zip(truths).map(|(picture, truth)| (picture.instance, *truth, picture.intrinsics)).collect();
+        let renders = render(on, &at_truth)?;
+        let parts = pictures.iter().zip(&renders).map(|(picture, render)| unexplained(picture, &render.rgb));
+        let median = Statistics::of(parts).median;
+        if median.is_finite() {
+            usual.insert(name.clone(), median);
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(usual)
+}
+
 /// What the searches tell of others. `None` if none of them has second derivatives and found its pose.
-fn calibration(known: &[Known]) -> Option<Calibration> {
+fn calibration(known: &[Known], usual: BTreeMap<String, f64>) -> Option<Calibration> {
     let found = known.iter().filter(|known| !known.has_failed());
     let errors: Vec<_> = found.filter_map(|known| known.shape.map(|shape| (known.motion, shape))).collect();
     let (curvature, floor) = fit(&errors)?;
-    let (unexplained, rival) = limits(known);
-    Some(Calibration { curvature, floor, unexplained, rival, views: known.len() as u32 })
+    let Limits { unexplained, above_usual, rival } = limits(known);
+    Some(Calibration { curvature, floor, unexplained, usual, above_usual, rival, views: known.len() as u32 })
 }
 
-/// The limits of what is unexplained and of the rival that tell the failures best: by the harmonic mean of precision and recall.
-fn limits(known: &[Known]) -> (f64, f64) {
+/// What an estimate to be trusted keeps to, see [`Calibration`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Limits {
+    unexplained: f64,
+    above_usual: f64,
+    rival: f64,
+}
+
+impl Limits {
+    fn trust(&self, known: &Known) -> bool {
+        known.unexplained <= self.unexplained && known.over_usual <= self.above_usual && known.rival >= self.rival
+    }
+
+    fn is_looser(&self, other: &Limits) -> bool {
+        self.unexplained >= other.unexplained && self.above_usual >= other.above_usual && self.rival <= other.rival
+    }
+}
+
+/// The limits that tell the failures best: by the harmonic mean of precision and recall.
+fn limits(known: &[Known]) -> Limits {
+    let finite = |value: &dyn Fn(&Known) -> f64| known.iter().map(value).filter(|value| value.is_finite()).collect::<Vec<f64>>();
+    let found = known.iter().filter(|known| !known.has_failed());
+    // What failed by far more than anything that was found has does not say how much is too much.
+    let most = |value: &dyn Fn(&Known) -> f64| found.clone().map(value).filter(|value| value.is_finite()).fold(0.0, f64::max);
+    let unexplained = MARGIN * most(&|known| known.unexplained);
+    let loosest = Limits { unexplained, above_usual: MARGIN * most(&|known| known.over_usual), rival: 0.0 };
     let failures = known.iter().filter(|known| known.has_failed()).count();
-    let between = |values: &dyn Fn(&Known) -> f64| -> Vec<f64> {
-        let mut values: Vec<f64> = known.iter().map(values).filter(|value| value.is_finite()).collect();
-        values.sort_by(f64::total_cmp);
-        values.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect()
-    };
-    let most = known.iter().map(|known| known.unexplained).filter(|value| value.is_finite()).fold(0.0, f64::max);
-    let loosest = (MARGIN * most, 0.0);
     if failures == 0 {
         return loosest;
     }
-    let score = |(unexplained, rival): (f64, f64)| {
-        let told = |known: &&Known| !(known.unexplained <= unexplained && known.rival >= rival);
-        let right = known.iter().filter(|known| known.has_failed()).filter(told).count();
-        2.0 * right as f64 / (known.iter().filter(told).count() + failures) as f64
+    let between = |value: &dyn Fn(&Known) -> f64, loosest: f64| -> Vec<f64> {
+        let mut values = finite(value);
+        values.sort_by(f64::total_cmp);
+        let between = values.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();
+        spread(between, CANDIDATES).into_iter().chain([loosest]).collect()
     };
-    let mut best = (score(loosest), loosest);
-    for unexplained in between(&|known| known.unexplained).into_iter().chain([loosest.0]) {
-        for rival in between(&|known| known.rival).into_iter().chain([0.0]) {
-            let limits = (unexplained, rival);
-            // The tightest of equals loses: what was not seen to fail is trusted.
-            let is_looser = unexplained >= best.1.0 && rival <= best.1.1;
-            let score = score(limits);
-            if score > best.0 || score == best.0 && is_looser {
-                best = (score, limits);
+    let score = |limits: &Limits| {
+        let told = known.iter().filter(|known| !limits.trust(known));
+        let right = told.clone().filter(|known| known.has_failed()).count();
+        2.0 * right as f64 / (told.count() + failures) as f64
+    };
+    let mut best = (score(&loosest), loosest);
+    for unexplained in between(&|known| known.unexplained, loosest.unexplained) {
+        for above_usual in between(&|known| known.over_usual, loosest.above_usual) {
+            for rival in between(&|known| known.rival, loosest.rival) {
+                let limits = Limits { unexplained, above_usual, rival };
+                // The tightest of equals loses: what was not seen to fail is trusted.
+                let score = score(&limits);
+                if score > best.0 || score == best.0 && limits.is_looser(&best.1) {
+                    best = (score, limits);
+                }
             }
         }
     }
@@ -153,17 +211,18 @@ fn limits(known: &[Known]) -> (f64, f64) {
 mod tests {
     use super::*;
 
+    /// Of an instance that usually leaves a tenth unexplained.
     fn known(rotation_deg: f64, unexplained: f64, rival: f64) -> Known {
         let shape = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
-        Known { rotation_deg, motion: [0.01; 6], shape: Some(shape), unexplained, rival }
+        Known { rotation_deg, motion: [0.01; 6], shape: Some(shape), unexplained, over_usual: unexplained / 0.1, rival }
     }
 
     #[test]
     fn without_failures_the_limits_are_loose() {
         let views: Vec<Known> = (1..=9).map(|k| known(1.0, 0.01 * f64::from(k), f64::INFINITY)).collect();
-        let found = calibration(&views).unwrap();
+        let found = calibration(&views, BTreeMap::new()).unwrap();
         assert!((found.unexplained - 0.135).abs() < 1e-12 && found.rival == 0.0 && found.views == 9, "{found:?}");
-        assert_eq!(calibration(&[known(90.0, 0.1, 1.0)]), None);
+        assert_eq!(calibration(&[known(90.0, 0.1, 1.0)], BTreeMap::new()), None);
     }
 
     #[test]
@@ -171,7 +230,17 @@ mod tests {
         let mut views: Vec<Known> = (0..20).map(|k| known(1.0, 0.1 + 0.002 * f64::from(k), 0.5)).collect();
         views.push(known(90.0, 0.3, 0.5));
         views.push(known(170.0, 0.1, 0.02));
-        let (unexplained, rival) = limits(&views);
-        assert!((0.14..0.3).contains(&unexplained) && (0.02..0.5).contains(&rival), "{unexplained} {rival}");
+        let found = limits(&views);
+        assert!(views.iter().all(|view| found.trust(view) != view.has_failed()), "{found:?}");
+    }
+
+    #[test]
+    fn limits_tell_failures_by_what_is_usual_for_the_object() {
+        // One object is known well, one badly: no limit for both would do.
+        let mut views: Vec<Known> = (0..20).map(|k| known(1.0, 0.08 + 0.002 * f64::from(k), 0.5)).collect();
+        views.extend((0..20).map(|k| Known { over_usual: 1.0 + 0.01 * f64::from(k), ..known(1.0, 0.4, 0.5) }));
+        views.push(known(90.0, 0.3, 0.5));
+        let found = limits(&views);
+        assert!(views.iter().all(|view| found.trust(view) != view.has_failed()), "{found:?}");
     }
 }

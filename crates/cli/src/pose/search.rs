@@ -226,19 +226,20 @@ impl SearchArgs {
 
     fn found(&self, model: &Model, picture: &Picture, estimate: Estimate, render: Rendering, seconds: f64) -> Found {
         let unexplained = unexplained(picture, &render.rgb);
-        let trusted = self.trusts(model, &estimate, unexplained);
+        let trusted = self.trusts(model, picture.instance, &estimate, unexplained);
         let confidence = model.metadata.calibration.as_ref().and_then(|calibration| Confidence::of(&estimate, calibration));
         let world_from_camera = estimate.pose.to_matrix();
         Found { world_from_camera, estimate, rgb: render.rgb, unexplained, trusted, confidence, seconds }
     }
 
     /// Whether an estimate is to be trusted.
-    fn trusts(&self, model: &Model, estimate: &Estimate, unexplained: f64) -> bool {
+    fn trusts(&self, model: &Model, instance: u32, estimate: &Estimate, unexplained: f64) -> bool {
         let explains = |most: f64| estimate.loss.is_finite() && unexplained <= most;
         match (self.accept, &model.metadata.calibration) {
             (Some(most), _) => explains(most),
             (None, Some(calibration)) => {
-                explains(calibration.unexplained) && estimate.rival().is_none_or(|(_, higher)| higher >= calibration.rival)
+                let rival = estimate.rival().map(|(_, higher)| higher);
+                estimate.loss.is_finite() && calibration.trusts(&model.instance_name(instance), unexplained, rival)
             }
             (None, None) => explains(ACCEPT),
         }
@@ -360,7 +361,7 @@ impl std::fmt::Display for PoseError {
 }
 
 /// Sum of absolute differences to `render`, over that to a white picture; not a number if the render has one.
-fn unexplained(picture: &Picture, render: &[f32]) -> f64 {
+pub fn unexplained(picture: &Picture, render: &[f32]) -> f64 {
     let weight = |value: usize| picture.weights.as_ref().map_or(1.0, |weights| weights[value / 3]);
     let sum = |difference: &dyn Fn(usize) -> f32| {
         (0..picture.rgb.len()).map(|value| f64::from(weight(value) * difference(value).abs())).sum::<f64>()
