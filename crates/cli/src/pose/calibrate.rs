@@ -4,11 +4,13 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::Args;
-use sigma_srn::Calibration;
+use glam::DMat4;
 use sigma_srn::confidence::{Matrix6, fit, motion};
+use sigma_srn::{Calibration, Effort, Options};
 
+use super::files::Picture;
 use super::notation::Notation;
-use super::search::{On, PoseError, SearchArgs, Starts, View, render, unexplained};
+use super::search::{Found, On, PoseError, SearchArgs, Starts, View, render, unexplained};
 use super::summary::Statistics;
 use super::views::{self, Views, spread};
 use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
@@ -16,6 +18,11 @@ use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_exis
 /// Where no search failed: the limits of what is unexplained, over the most that was.
 const MARGIN: f64 = 1.5;
 
+/// How far from the truth a search begins that is to lose it, in degrees.
+const FAR_DEG: f64 = 90.0;
+/// What a search that was made to fail counts beside one that was not: about one pose in five is then wrong, more than in earnest, for
+/// trusting a wrong pose is worse than doubting a right one.
+const LOST_WEIGHT: f64 = 0.25;
 /// Values of each limit that are tried, at most.
 const CANDIDATES: usize = 64;
 
@@ -69,6 +76,17 @@ struct Known {
 }
 
 impl Known {
+    fn of(found: &Found, truth: &DMat4, usual: Option<&f64>) -> Self {
+        Known {
+            rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
+            motion: motion(&found.world_from_camera, truth),
+            shape: found.estimate.shape(),
+            unexplained: found.unexplained,
+            over_usual: usual.map_or(0.0, |usual| found.unexplained / usual),
+            rival: found.estimate.rival().map_or(f64::INFINITY, |(_, higher)| higher),
+        }
+    }
+
     fn has_failed(&self) -> bool {
         self.rotation_deg > PoseError::FAILURE_DEG
     }
@@ -90,16 +108,10 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     let found = views::search(&asked, on, &args.search, &args.starts, &Notation::default(), |_, _| Ok(()))?;
     let mut known = Vec::new();
     for (Views { name, truths, .. }, found) in asked.iter().zip(&found) {
-        known.extend(found.iter().zip(truths).map(|(found, truth)| Known {
-            rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
-            motion: motion(&found.world_from_camera, truth),
-            shape: found.estimate.shape(),
-            unexplained: found.unexplained,
-            over_usual: usual.get(name).map_or(0.0, |usual| found.unexplained / usual),
-            rival: found.estimate.rival().map_or(f64::INFINITY, |(_, higher)| higher),
-        }));
+        known.extend(found.iter().zip(truths).map(|(found, truth)| Known::of(found, truth, usual.get(name))));
     }
-    let calibration = calibration(&known, usual).ok_or("no search came near enough to the truth to learn from")?;
+    let lost = lost(args, on, &asked, &usual)?;
+    let calibration = calibration(&known, &lost, usual).ok_or("no search came near enough to the truth to learn from")?;
     model.metadata.calibration = Some(calibration.clone());
     model.save(&args.out)?;
     if args.json {
@@ -107,7 +119,10 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     } else {
         let failures = known.iter().filter(|known| known.has_failed()).count();
         let Calibration { curvature, floor, unexplained, above_usual, rival, views, .. } = calibration;
-        print(&format!("{views} views, {failures} of them more than {}° off", PoseError::FAILURE_DEG))?;
+        let (far, lost) = (PoseError::FAILURE_DEG, lost.len());
+        print(&format!(
+            "{views} views, {failures} of them more than {far}° off; {lost} wrong poses by searches begun far from the truth"
+        ))?;
         print(&format!("covariance: {curvature:.2e} × loss × inverse of its second derivatives"))?;
         let [a, b, c] = [0, 1, 2].map(|k| floor[k].sqrt().to_degrees());
         let [x, y, z] = [3, 4, 5].map(|k| floor[k].sqrt());
@@ -141,12 +156,33 @@ fn usual(on: On, all: &[Views]) -> Result<BTreeMap<String, f64>> {
     Ok(usual)
 }
 
+/// Wrong poses, as a search ends in that begins on the far side: too few searches fail by themselves to learn from.
+fn lost(args: &Calibrate, on: On, asked: &[Views], usual: &BTreeMap<String, f64>) -> Result<Vec<Known>> {
+    let options = Options { min_starts: 0, ..Options::of(Effort::Fast) };
+    let bar = progress(asked.len() as u64, "wrong poses");
+    let mut lost = Vec::new();
+    for Views { name, pictures, truths, .. } in asked {
+        let far = |(picture, truth): (&Picture, &DMat4)| -> Result<Vec<DMat4>> {
+            let all = args.search.starts(&Starts::Around84, on.model, picture, on.side, None, &Notation::default())?;
+            Ok(all.into_iter().filter(|start| PoseError::of(start, truth).rotation_deg > FAR_DEG).collect())
+        };
+        let starts = pictures.iter().zip(truths).map(far).collect::<Result<Vec<_>>>()?;
+        let found = args.search.run(&options, on, pictures, &starts, |_| Ok(()))?;
+        let known = found.iter().zip(truths).map(|(found, truth)| Known::of(found, truth, usual.get(name)));
+        // Rivals are those of a search that is not hindered.
+        lost.extend(known.filter(Known::has_failed).map(|known| Known { rival: f64::INFINITY, ..known }));
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(lost)
+}
+
 /// What the searches tell of others. `None` if none of them has second derivatives and found its pose.
-fn calibration(known: &[Known], usual: BTreeMap<String, f64>) -> Option<Calibration> {
+fn calibration(known: &[Known], lost: &[Known], usual: BTreeMap<String, f64>) -> Option<Calibration> {
     let found = known.iter().filter(|known| !known.has_failed());
     let errors: Vec<_> = found.filter_map(|known| known.shape.map(|shape| (known.motion, shape))).collect();
     let (curvature, floor) = fit(&errors)?;
-    let Limits { unexplained, above_usual, rival } = limits(known);
+    let Limits { unexplained, above_usual, rival } = limits(known, lost);
     Some(Calibration { curvature, floor, unexplained, usual, above_usual, rival, views: known.len() as u32 })
 }
 
@@ -169,27 +205,30 @@ impl Limits {
 }
 
 /// The limits that tell the failures best: by the harmonic mean of precision and recall.
-fn limits(known: &[Known]) -> Limits {
-    let finite = |value: &dyn Fn(&Known) -> f64| known.iter().map(value).filter(|value| value.is_finite()).collect::<Vec<f64>>();
-    let found = known.iter().filter(|known| !known.has_failed());
+fn limits(known: &[Known], lost: &[Known]) -> Limits {
+    let found = || known.iter().filter(|known| !known.has_failed());
     // What failed by far more than anything that was found has does not say how much is too much.
-    let most = |value: &dyn Fn(&Known) -> f64| found.clone().map(value).filter(|value| value.is_finite()).fold(0.0, f64::max);
+    let most = |value: &dyn Fn(&Known) -> f64| found().map(value).filter(|value| value.is_finite()).fold(0.0, f64::max);
     let unexplained = MARGIN * most(&|known| known.unexplained);
     let loosest = Limits { unexplained, above_usual: MARGIN * most(&|known| known.over_usual), rival: 0.0 };
-    let failures = known.iter().filter(|known| known.has_failed()).count();
-    if failures == 0 {
+    let all = || known.iter().map(|known| (known, 1.0)).chain(lost.iter().map(|known| (known, LOST_WEIGHT)));
+    let failures: f64 = all().filter(|(known, _)| known.has_failed()).map(|(_, weight)| weight).sum();
+    if failures == 0.0 {
         return loosest;
     }
     let between = |value: &dyn Fn(&Known) -> f64, loosest: f64| -> Vec<f64> {
-        let mut values = finite(value);
+        let mut values: Vec<f64> = all().map(|(known, _)| value(known)).filter(|value| value.is_finite()).collect();
         values.sort_by(f64::total_cmp);
         let between = values.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();
         spread(between, CANDIDATES).into_iter().chain([loosest]).collect()
     };
     let score = |limits: &Limits| {
-        let told = known.iter().filter(|known| !limits.trust(known));
-        let right = told.clone().filter(|known| known.has_failed()).count();
-        2.0 * right as f64 / (told.count() + failures) as f64
+        let (mut told, mut right) = (0.0, 0.0);
+        for (known, weight) in all().filter(|(known, _)| !limits.trust(known)) {
+            told += weight;
+            right += if known.has_failed() { weight } else { 0.0 };
+        }
+        2.0 * right / (told + failures)
     };
     let mut best = (score(&loosest), loosest);
     for unexplained in between(&|known| known.unexplained, loosest.unexplained) {
@@ -220,9 +259,9 @@ mod tests {
     #[test]
     fn without_failures_the_limits_are_loose() {
         let views: Vec<Known> = (1..=9).map(|k| known(1.0, 0.01 * f64::from(k), f64::INFINITY)).collect();
-        let found = calibration(&views, BTreeMap::new()).unwrap();
+        let found = calibration(&views, &[], BTreeMap::new()).unwrap();
         assert!((found.unexplained - 0.135).abs() < 1e-12 && found.rival == 0.0 && found.views == 9, "{found:?}");
-        assert_eq!(calibration(&[known(90.0, 0.1, 1.0)], BTreeMap::new()), None);
+        assert_eq!(calibration(&[known(90.0, 0.1, 1.0)], &[], BTreeMap::new()), None);
     }
 
     #[test]
@@ -230,7 +269,7 @@ mod tests {
         let mut views: Vec<Known> = (0..20).map(|k| known(1.0, 0.1 + 0.002 * f64::from(k), 0.5)).collect();
         views.push(known(90.0, 0.3, 0.5));
         views.push(known(170.0, 0.1, 0.02));
-        let found = limits(&views);
+        let found = limits(&views, &[]);
         assert!(views.iter().all(|view| found.trust(view) != view.has_failed()), "{found:?}");
     }
 
@@ -240,7 +279,7 @@ mod tests {
         let mut views: Vec<Known> = (0..20).map(|k| known(1.0, 0.08 + 0.002 * f64::from(k), 0.5)).collect();
         views.extend((0..20).map(|k| Known { over_usual: 1.0 + 0.01 * f64::from(k), ..known(1.0, 0.4, 0.5) }));
         views.push(known(90.0, 0.3, 0.5));
-        let found = limits(&views);
+        let found = limits(&views, &[]);
         assert!(views.iter().all(|view| found.trust(view) != view.has_failed()), "{found:?}");
     }
 }

@@ -8,7 +8,7 @@ use sigma_srn::Intrinsics;
 use sigma_srn::camera::around84;
 
 use super::search::{On, View, render};
-use crate::common::Result;
+use crate::common::{Result, progress};
 
 /// Views that are compared.
 const VIEWS: usize = 12;
@@ -48,14 +48,17 @@ impl Symmetries {
         let plain = seen(DMat4::IDENTITY)?;
         let object = sum(&mut plain.iter().map(|value| value - 1.0));
         let mut turns = Vec::new();
+        let bar = progress(3 * TURNS.len() as u64, "symmetries");
         for axis in 0..3 {
             for degrees in TURNS {
                 let turned = seen(DMat4::from_mat3(turn(axis, f64::from(degrees).to_radians())))?;
                 if sum(&mut plain.iter().zip(&turned).map(|(a, b)| a - b)) <= LIMIT * object {
                     turns.push((axis, degrees));
                 }
+                bar.inc(1);
             }
         }
+        bar.finish_and_clear();
         let round = (0..3).find(|&axis| turns.iter().filter(|turn| turn.0 == axis).count() == TURNS.len());
         Ok(Symmetries { turns, round })
     }
