@@ -23,12 +23,12 @@ pub struct Calibration {
     pub floor: [f64; 6],
     /// Part of a picture that an estimate to be trusted leaves unexplained at most.
     pub unexplained: f64,
-    /// By instance, the part of a picture that the true pose leaves unexplained: the median. The network knows one object better than another.
+    /// By instance, the part of a picture that its true poses leave unexplained at most: the network knows one object better than another.
     #[serde(default)]
-    pub usual: BTreeMap<String, f64>,
-    /// How many times what is `usual` for its instance an estimate to be trusted leaves unexplained at most.
+    pub at_truth: BTreeMap<String, f64>,
+    /// How many times that an estimate to be trusted leaves unexplained at most.
     #[serde(default)]
-    pub above_usual: f64,
+    pub above_truth: f64,
     /// How much higher, as a part, the loss must be at the next best pose elsewhere for an estimate to be trusted.
     pub rival: f64,
     /// Number of estimates that this is from.
@@ -38,8 +38,8 @@ pub struct Calibration {
 impl Calibration {
     /// Whether an estimate of this instance is to be trusted, by what it leaves unexplained and by its rival, if there is one.
     pub fn trusts(&self, instance: &str, unexplained: f64, rival_higher: Option<f64>) -> bool {
-        let is_usual = self.usual.get(instance).is_none_or(|usual| unexplained <= self.above_usual * usual);
-        unexplained <= self.unexplained && is_usual && rival_higher.is_none_or(|higher| higher >= self.rival)
+        let is_known = self.at_truth.get(instance).is_none_or(|most| unexplained <= self.above_truth * most);
+        unexplained <= self.unexplained && is_known && rival_higher.is_none_or(|higher| higher >= self.rival)
     }
 }
 
@@ -197,7 +197,7 @@ mod tests {
     }
 
     fn calibration(curvature: f64, floor: [f64; 6]) -> Calibration {
-        Calibration { curvature, floor, unexplained: 1.0, usual: BTreeMap::new(), above_usual: 0.0, rival: 0.0, views: 1 }
+        Calibration { curvature, floor, unexplained: 1.0, at_truth: BTreeMap::new(), above_truth: 0.0, rival: 0.0, views: 1 }
     }
 
     #[test]

@@ -11,7 +11,6 @@ use sigma_srn::{Calibration, Effort, Options};
 use super::files::Picture;
 use super::notation::Notation;
 use super::search::{Found, On, PoseError, SearchArgs, Starts, View, render, unexplained};
-use super::summary::Statistics;
 use super::views::{self, Views, spread};
 use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
 
@@ -69,20 +68,20 @@ struct Known {
     /// See `Estimate::shape`.
     shape: Option<Matrix6>,
     unexplained: f64,
-    /// The same, over what is usual for the instance; 0 where that is not known.
-    over_usual: f64,
+    /// The same, over the most that the instance's true poses leave; 0 where that is not known.
+    over_truth: f64,
     /// Infinite without a rival.
     rival: f64,
 }
 
 impl Known {
-    fn of(found: &Found, truth: &DMat4, usual: Option<&f64>) -> Self {
+    fn of(found: &Found, truth: &DMat4, at_truth: Option<&f64>) -> Self {
         Known {
             rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
             motion: motion(&found.world_from_camera, truth),
             shape: found.estimate.shape(),
             unexplained: found.unexplained,
-            over_usual: usual.map_or(0.0, |usual| found.unexplained / usual),
+            over_truth: at_truth.map_or(0.0, |most| found.unexplained / most),
             rival: found.estimate.rival().map_or(f64::INFINITY, |(_, higher)| higher),
         }
     }
@@ -99,7 +98,7 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     refuse_existing([args.out.clone()], args.force)?;
     let engine = args.engine.open()?;
     let on = On { engine: &engine, model: &model, side };
-    let usual = usual(on, &all)?;
+    let at_truth = at_truth(on, &all)?;
     let mut asked = spread(all, args.instances as usize);
     for Views { pictures, truths, .. } in &mut asked {
         *pictures = spread(std::mem::take(pictures), args.views as usize);
@@ -108,17 +107,17 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     let found = views::search(&asked, on, &args.search, &args.starts, &Notation::default(), |_, _| Ok(()))?;
     let mut known = Vec::new();
     for (Views { name, truths, .. }, found) in asked.iter().zip(&found) {
-        known.extend(found.iter().zip(truths).map(|(found, truth)| Known::of(found, truth, usual.get(name))));
+        known.extend(found.iter().zip(truths).map(|(found, truth)| Known::of(found, truth, at_truth.get(name))));
     }
-    let lost = lost(args, on, &asked, &usual)?;
-    let calibration = calibration(&known, &lost, usual).ok_or("no search came near enough to the truth to learn from")?;
+    let lost = lost(args, on, &asked, &at_truth)?;
+    let calibration = calibration(&known, &lost, at_truth).ok_or("no search came near enough to the truth to learn from")?;
     model.metadata.calibration = Some(calibration.clone());
     model.save(&args.out)?;
     if args.json {
         print(&serde_json::to_string_pretty(&calibration)?)?;
     } else {
         let failures = known.iter().filter(|known| known.has_failed()).count();
-        let Calibration { curvature, floor, unexplained, above_usual, rival, views, .. } = calibration;
+        let Calibration { curvature, floor, unexplained, above_truth, rival, views, .. } = calibration;
         let (far, lost) = (PoseError::FAILURE_DEG, lost.len());
         print(&format!(
             "{views} views, {failures} of them more than {far}° off; {lost} wrong poses by searches begun far from the truth"
@@ -128,7 +127,7 @@ pub fn run(args: &Calibrate) -> Result<bool> {
         let [x, y, z] = [3, 4, 5].map(|k| floor[k].sqrt());
         print(&format!("and in all views ± {a:.2}° {b:.2}° {c:.2}° about the camera's axes, ± {x:.4} {y:.4} {z:.4} along them"))?;
         print(&format!(
-            "trusted: at most {:.1} % unexplained, {above_usual:.1} times what is usual for the object, and a loss {:.1} % higher elsewhere",
+            "trusted: at most {:.1} % unexplained, {above_truth:.1} times what true poses of the object leave, and a loss {:.1} % higher elsewhere",
             100.0 * unexplained,
             100.0 * rival
         ))?;
@@ -137,27 +136,27 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     Ok(true)
 }
 
-/// The part of a picture that its true pose leaves unexplained, the median of each instance.
-fn usual(on: On, all: &[Views]) -> Result<BTreeMap<String, f64>> {
+/// The part of a picture that its true pose leaves unexplained, the most of each instance.
+fn at_truth(on: On, all: &[Views]) -> Result<BTreeMap<String, f64>> {
     let bar = progress(all.len() as u64, "instances");
-    let mut usual = BTreeMap::new();
+    let mut at_truth = BTreeMap::new();
     for Views { name, pictures, truths, .. } in all {
-        let at_truth: Vec<View> =
+        let true_views: Vec<View> =
             pictures.iter().zip(truths).map(|(picture, truth)| (picture.instance, *truth, picture.intrinsics)).collect();
-        let renders = render(on, &at_truth)?;
+        let renders = render(on, &true_views)?;
         let parts = pictures.iter().zip(&renders).map(|(picture, render)| unexplained(picture, &render.rgb));
-        let median = Statistics::of(parts).median;
-        if median.is_finite() {
-            usual.insert(name.clone(), median);
+        let most = parts.fold(0.0, |most, part| if part > most || part.is_nan() { part } else { most });
+        if most.is_finite() {
+            at_truth.insert(name.clone(), most);
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    Ok(usual)
+    Ok(at_truth)
 }
 
 /// Wrong poses, as a search ends in that begins on the far side: too few searches fail by themselves to learn from.
-fn lost(args: &Calibrate, on: On, asked: &[Views], usual: &BTreeMap<String, f64>) -> Result<Vec<Known>> {
+fn lost(args: &Calibrate, on: On, asked: &[Views], at_truth: &BTreeMap<String, f64>) -> Result<Vec<Known>> {
     let options = Options { min_starts: 0, ..Options::of(Effort::Fast) };
     let bar = progress(asked.len() as u64, "wrong poses");
     let mut lost = Vec::new();
@@ -168,7 +167,7 @@ fn lost(args: &Calibrate, on: On, asked: &[Views], usual: &BTreeMap<String, f64>
         };
         let starts = pictures.iter().zip(truths).map(far).collect::<Result<Vec<_>>>()?;
         let found = args.search.run(&options, on, pictures, &starts, |_| Ok(()))?;
-        let known = found.iter().zip(truths).map(|(found, truth)| Known::of(found, truth, usual.get(name)));
+        let known = found.iter().zip(truths).map(|(found, truth)| Known::of(found, truth, at_truth.get(name)));
         // Rivals are those of a search that is not hindered.
         lost.extend(known.filter(Known::has_failed).map(|known| Known { rival: f64::INFINITY, ..known }));
         bar.inc(1);
@@ -178,29 +177,29 @@ fn lost(args: &Calibrate, on: On, asked: &[Views], usual: &BTreeMap<String, f64>
 }
 
 /// What the searches tell of others. `None` if none of them has second derivatives and found its pose.
-fn calibration(known: &[Known], lost: &[Known], usual: BTreeMap<String, f64>) -> Option<Calibration> {
+fn calibration(known: &[Known], lost: &[Known], at_truth: BTreeMap<String, f64>) -> Option<Calibration> {
     let found = known.iter().filter(|known| !known.has_failed());
     let errors: Vec<_> = found.filter_map(|known| known.shape.map(|shape| (known.motion, shape))).collect();
     let (curvature, floor) = fit(&errors)?;
-    let Limits { unexplained, above_usual, rival } = limits(known, lost);
-    Some(Calibration { curvature, floor, unexplained, usual, above_usual, rival, views: known.len() as u32 })
+    let Limits { unexplained, above_truth, rival } = limits(known, lost);
+    Some(Calibration { curvature, floor, unexplained, at_truth, above_truth, rival, views: known.len() as u32 })
 }
 
 /// What an estimate to be trusted keeps to, see [`Calibration`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Limits {
     unexplained: f64,
-    above_usual: f64,
+    above_truth: f64,
     rival: f64,
 }
 
 impl Limits {
     fn trust(&self, known: &Known) -> bool {
-        known.unexplained <= self.unexplained && known.over_usual <= self.above_usual && known.rival >= self.rival
+        known.unexplained <= self.unexplained && known.over_truth <= self.above_truth && known.rival >= self.rival
     }
 
     fn is_looser(&self, other: &Limits) -> bool {
-        self.unexplained >= other.unexplained && self.above_usual >= other.above_usual && self.rival <= other.rival
+        self.unexplained >= other.unexplained && self.above_truth >= other.above_truth && self.rival <= other.rival
     }
 }
 
@@ -210,7 +209,7 @@ fn limits(known: &[Known], lost: &[Known]) -> Limits {
     // What failed by far more than anything that was found has does not say how much is too much.
     let most = |value: &dyn Fn(&Known) -> f64| found().map(value).filter(|value| value.is_finite()).fold(0.0, f64::max);
     let unexplained = MARGIN * most(&|known| known.unexplained);
-    let loosest = Limits { unexplained, above_usual: MARGIN * most(&|known| known.over_usual), rival: 0.0 };
+    let loosest = Limits { unexplained, above_truth: MARGIN * most(&|known| known.over_truth), rival: 0.0 };
     let all = || known.iter().map(|known| (known, 1.0)).chain(lost.iter().map(|known| (known, LOST_WEIGHT)));
     let failures: f64 = all().filter(|(known, _)| known.has_failed()).map(|(_, weight)| weight).sum();
     if failures == 0.0 {
@@ -232,9 +231,9 @@ fn limits(known: &[Known], lost: &[Known]) -> Limits {
     };
     let mut best = (score(&loosest), loosest);
     for unexplained in between(&|known| known.unexplained, loosest.unexplained) {
-        for above_usual in between(&|known| known.over_usual, loosest.above_usual) {
+        for above_truth in between(&|known| known.over_truth, loosest.above_truth) {
             for rival in between(&|known| known.rival, loosest.rival) {
-                let limits = Limits { unexplained, above_usual, rival };
+                let limits = Limits { unexplained, above_truth, rival };
                 // The tightest of equals loses: what was not seen to fail is trusted.
                 let score = score(&limits);
                 if score > best.0 || score == best.0 && limits.is_looser(&best.1) {
@@ -250,10 +249,10 @@ fn limits(known: &[Known], lost: &[Known]) -> Limits {
 mod tests {
     use super::*;
 
-    /// Of an instance that usually leaves a tenth unexplained.
+    /// Of an instance whose true poses leave a tenth unexplained at most.
     fn known(rotation_deg: f64, unexplained: f64, rival: f64) -> Known {
         let shape = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
-        Known { rotation_deg, motion: [0.01; 6], shape: Some(shape), unexplained, over_usual: unexplained / 0.1, rival }
+        Known { rotation_deg, motion: [0.01; 6], shape: Some(shape), unexplained, over_truth: unexplained / 0.1, rival }
     }
 
     #[test]
@@ -274,10 +273,10 @@ mod tests {
     }
 
     #[test]
-    fn limits_tell_failures_by_what_is_usual_for_the_object() {
+    fn limits_tell_failures_by_what_true_poses_of_the_object_leave() {
         // One object is known well, one badly: no limit for both would do.
         let mut views: Vec<Known> = (0..20).map(|k| known(1.0, 0.08 + 0.002 * f64::from(k), 0.5)).collect();
-        views.extend((0..20).map(|k| Known { over_usual: 1.0 + 0.01 * f64::from(k), ..known(1.0, 0.4, 0.5) }));
+        views.extend((0..20).map(|k| Known { over_truth: 1.0 + 0.01 * f64::from(k), ..known(1.0, 0.4, 0.5) }));
         views.push(known(90.0, 0.3, 0.5));
         let found = limits(&views, &[]);
         assert!(views.iter().all(|view| found.trust(view) != view.has_failed()), "{found:?}");
