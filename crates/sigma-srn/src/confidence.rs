@@ -36,10 +36,14 @@ pub struct Calibration {
 }
 
 impl Calibration {
-    /// Whether an estimate of this instance is to be trusted, by what it leaves unexplained and by its rival, if there is one.
+    /// Whether an estimate of this instance is to be trusted, by what it leaves unexplained and by its rival, if there is one. An instance that
+    /// is not in `at_truth` is taken for one as good as half of those that are.
     pub fn trusts(&self, instance: &str, unexplained: f64, rival_higher: Option<f64>) -> bool {
-        let is_known = self.at_truth.get(instance).is_none_or(|most| unexplained <= self.above_truth * most);
-        unexplained <= self.unexplained && is_known && rival_higher.is_none_or(|higher| higher >= self.rival)
+        let mut all: Vec<f64> = self.at_truth.values().copied().collect();
+        all.sort_by(f64::total_cmp);
+        let most = self.at_truth.get(instance).or(all.get(all.len() / 2));
+        let is_explained = most.is_none_or(|most| unexplained <= self.above_truth * most);
+        unexplained <= self.unexplained && is_explained && rival_higher.is_none_or(|higher| higher >= self.rival)
     }
 }
 
@@ -194,6 +198,27 @@ mod tests {
         let turned = Pose6::from_matrix(&(DMat4::from_rotation_z(1.0) * pose.to_matrix()));
         let ranking = vec![ranked(7, 2.0, pose), ranked(3, 2.1, pose), ranked(5, 3.0, turned)];
         Estimate { pose, loss: 2.0, curvature: Some(curvature()), ranking }
+    }
+
+    #[test]
+    fn an_estimate_is_trusted_by_what_its_object_allows() {
+        let at_truth = [("well", 0.1), ("usual", 0.2), ("badly", 0.5)].map(|(name, most)| (name.to_string(), most));
+        let known = Calibration {
+            unexplained: 0.9,
+            at_truth: at_truth.into(),
+            above_truth: 1.5,
+            rival: 0.1,
+            ..calibration(1.0, [1.0; 6])
+        };
+        let cases =
+            [("well", 0.14, true), ("well", 0.16, false), ("badly", 0.7, true), ("new", 0.29, true), ("new", 0.31, false)];
+        for (instance, unexplained, trusted) in cases {
+            assert_eq!(known.trusts(instance, unexplained, None), trusted, "{instance} {unexplained}");
+        }
+        assert!(known.trusts("well", 0.1, Some(0.2)) && !known.trusts("well", 0.1, Some(0.05)));
+        assert!(!known.trusts("well", f64::NAN, None));
+        let old = Calibration { at_truth: BTreeMap::new(), ..known };
+        assert!(old.trusts("well", 0.8, None) && !old.trusts("well", 1.0, None));
     }
 
     fn calibration(curvature: f64, floor: [f64; 6]) -> Calibration {

@@ -16,7 +16,6 @@ use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_exis
 
 /// Where no search failed: the limits of what is unexplained, over the most that was.
 const MARGIN: f64 = 1.5;
-
 /// How far from the truth a search begins that is to lose it, in degrees.
 const FAR_DEG: f64 = 90.0;
 /// What a search that was made to fail counts beside one that was not: about one pose in five is then wrong, more than in earnest, for
