@@ -245,10 +245,12 @@ impl Bench<'_> {
         let found = if setting.preset.is_none() {
             one_shot(on, asked, &search, &setting.starts)?
         } else {
-            let (mut running, mut began, mut number) = (usize::MAX, Instant::now(), 0);
+            // Each search begins when the one before has ended: before its first evaluation.
+            let mut last = Instant::now();
+            let (mut running, mut began, mut number) = (0, last, 0);
             views::search(asked, on, &search, &setting.starts, &notation, |i, progress| {
                 if i != running {
-                    (running, began, number) = (i, Instant::now(), 0);
+                    (running, began, number) = (i, last, 0);
                 }
                 let standing = progress.descent.standing()?;
                 if moments.len() == number {
@@ -260,7 +262,8 @@ impl Bench<'_> {
                     let pose = best.0.1.to_matrix();
                     moments[number].errors.push(PoseError::of(&pose, &symmetries[i].nearest(truth, &pose)).rotation_deg);
                 }
-                moments[number].seconds += began.elapsed().as_secs_f64();
+                last = Instant::now();
+                moments[number].seconds += last.duration_since(began).as_secs_f64();
                 number += 1;
                 Ok(())
             })?
