@@ -13,9 +13,14 @@ const BLOCK_ROWS: usize = 256;
 const WIDE_BLOCK_ROWS: usize = 512;
 const NARROW: usize = 128;
 
-/// Rows that keep all threads busy.
-pub fn rows_for_all_threads() -> usize {
-    2 * WIDE_BLOCK_ROWS * rayon::current_num_threads()
+/// Rows of a block where a row has up to `values` values.
+fn block_rows(values: usize) -> usize {
+    if values > NARROW { WIDE_BLOCK_ROWS } else { BLOCK_ROWS }
+}
+
+/// Rows of a network with layers of `features` that are a block for each thread.
+pub fn rows_for_all_threads(features: usize) -> usize {
+    block_rows(features) * rayon::current_num_threads()
 }
 
 thread_local! {
@@ -183,8 +188,7 @@ impl Chain {
     /// Makes the blocks, each of rows of one group.
     fn cut(&mut self) {
         let group = self.rows_per_group.unwrap_or(self.rows).max(1);
-        let is_wide = self.places.iter().any(|place| place.width > NARROW);
-        let most = if is_wide { WIDE_BLOCK_ROWS } else { BLOCK_ROWS };
+        let most = block_rows(self.places.iter().map(|place| place.width).max().unwrap_or(0));
         let of_group = |first: usize| (first..first + group).step_by(most).map(move |row| row..(first + group).min(row + most));
         self.blocks = (0..self.rows).step_by(group).flat_map(of_group).collect();
     }

@@ -126,7 +126,7 @@ impl Descent {
         }
         let rows = hypotheses * width * height;
         let (plan, handles) =
-            engine.fit(rows, model.layout.features(), |b, tile_rows| build(b, model, shape, method, tile_rows))?;
+            engine.fit(rows, model.layout.features(), Purpose::Pose, |b, tile_rows| build(b, model, shape, method, tile_rows))?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, model)?;
         if let Moves::Bfgs { seeds, .. } = handles.moves {

@@ -51,8 +51,9 @@ impl Renderer {
         }
         let rays = width * height;
         let size = [width, height];
-        let (plan, handles) =
-            engine.fit(views * rays, model.layout.features(), |b, tile_rows| build(b, model, views, size, tile_rows))?;
+        let (plan, handles) = engine.fit(views * rays, model.layout.features(), Purpose::Render, |b, tile_rows| {
+            build(b, model, views, size, tile_rows)
+        })?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, model)?;
         let slots: Vec<u32> = (0..views).collect();

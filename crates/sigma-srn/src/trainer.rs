@@ -96,7 +96,8 @@ impl Trainer {
         }
         model.hypernetwork()?;
         let features = model.layout.features();
-        let (plan, handles) = engine.fit(images * rays, features, |b, tile_rows| build(b, &model, train, batch, tile_rows))?;
+        let (plan, handles) =
+            engine.fit(images * rays, features, Purpose::Train, |b, tile_rows| build(b, &model, train, batch, tile_rows))?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, &model)?;
         let slots: Vec<u32> = (0..images).collect();
