@@ -67,14 +67,14 @@ struct Known {
     /// See `Estimate::shape`.
     shape: Option<Matrix6>,
     unexplained: f64,
-    /// The same, over the most that the instance's true poses leave; 0 where that is not known.
+    /// The same, over the most that the true poses of the instance's other views leave; 0 where that is not known.
     over_truth: f64,
     /// Infinite without a rival.
     rival: f64,
 }
 
 impl Known {
-    fn of(found: &Found, truth: &DMat4, at_truth: Option<&f64>) -> Self {
+    fn of(found: &Found, truth: &DMat4, at_truth: Option<f64>) -> Self {
         Known {
             rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
             motion: motion(&found.world_from_camera, truth),
@@ -97,7 +97,7 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     refuse_existing([args.out.clone()], args.force)?;
     let engine = args.engine.open()?;
     let on = On { engine: &engine, model: &model, side };
-    let at_truth = at_truth(on, &all)?;
+    let at_truth = AtTruth::of(on, &all)?;
     let mut asked = spread(all, args.instances as usize);
     for Views { pictures, truths, .. } in &mut asked {
         *pictures = spread(std::mem::take(pictures), args.views as usize);
@@ -105,11 +105,13 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     }
     let found = views::search(&asked, on, &args.search, &args.starts, &Notation::default(), |_, _| Ok(()))?;
     let mut known = Vec::new();
-    for (Views { name, truths, .. }, found) in asked.iter().zip(&found) {
-        known.extend(found.iter().zip(truths).map(|(found, truth)| Known::of(found, truth, at_truth.get(name))));
+    for (Views { name, pictures, truths, .. }, found) in asked.iter().zip(&found) {
+        let views = found.iter().zip(truths).zip(pictures);
+        known.extend(views.map(|((found, truth), picture)| Known::of(found, truth, at_truth.of_others(name, &picture.name))));
     }
     let lost = lost(args, on, &asked, &at_truth)?;
-    let calibration = calibration(&known, &lost, at_truth).ok_or("no search came near enough to the truth to learn from")?;
+    let calibration =
+        calibration(&known, &lost, at_truth.most()).ok_or("no search came near enough to the truth to learn from")?;
     model.metadata.calibration = Some(calibration.clone());
     model.save(&args.out)?;
     if args.json {
@@ -135,27 +137,47 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     Ok(true)
 }
 
-/// The part of a picture that its true pose leaves unexplained, the most of each instance.
-fn at_truth(on: On, all: &[Views]) -> Result<BTreeMap<String, f64>> {
-    let bar = progress(all.len() as u64, "instances");
-    let mut at_truth = BTreeMap::new();
-    for Views { name, pictures, truths, .. } in all {
-        let true_views: Vec<View> =
-            pictures.iter().zip(truths).map(|(picture, truth)| (picture.instance, *truth, picture.intrinsics)).collect();
-        let renders = render(on, &true_views)?;
-        let parts = pictures.iter().zip(&renders).map(|(picture, render)| unexplained(picture, &render.rgb));
-        let most = parts.fold(0.0, |most, part| if part > most || part.is_nan() { part } else { most });
-        if most.is_finite() {
-            at_truth.insert(name.clone(), most);
+/// The parts of pictures that their true poses leave unexplained, by instance and view.
+struct AtTruth(BTreeMap<String, BTreeMap<String, f64>>);
+
+impl AtTruth {
+    fn of(on: On, all: &[Views]) -> Result<Self> {
+        let bar = progress(all.len() as u64, "instances");
+        let mut at_truth = BTreeMap::new();
+        for Views { name, pictures, truths, .. } in all {
+            let true_views: Vec<View> =
+                pictures.iter().zip(truths).map(|(picture, truth)| (picture.instance, *truth, picture.intrinsics)).collect();
+            let renders = render(on, &true_views)?;
+            let parts =
+                pictures.iter().zip(&renders).map(|(picture, render)| (picture.name.clone(), unexplained(picture, &render.rgb)));
+            at_truth.insert(name.clone(), parts.filter(|(_, part)| part.is_finite()).collect());
+            bar.inc(1);
         }
-        bar.inc(1);
+        bar.finish_and_clear();
+        Ok(AtTruth(at_truth))
     }
-    bar.finish_and_clear();
-    Ok(at_truth)
+
+    /// The most of each instance; a single view does not say how much they differ.
+    fn most(&self) -> BTreeMap<String, f64> {
+        self.0
+            .iter()
+            .filter(|(_, parts)| parts.len() > 1)
+            .filter_map(|(name, parts)| Some((name.clone(), most(parts.values())?)))
+            .collect()
+    }
+
+    /// The most of the instance's other views: a view is not to be held against itself, for those to come will not be either.
+    fn of_others(&self, instance: &str, view: &str) -> Option<f64> {
+        most(self.0.get(instance)?.iter().filter(|(name, _)| *name != view).map(|(_, part)| part))
+    }
+}
+
+fn most<'a>(parts: impl Iterator<Item = &'a f64>) -> Option<f64> {
+    parts.copied().max_by(f64::total_cmp)
 }
 
 /// Wrong poses, as a search ends in that begins on the far side: too few searches fail by themselves to learn from.
-fn lost(args: &Calibrate, on: On, asked: &[Views], at_truth: &BTreeMap<String, f64>) -> Result<Vec<Known>> {
+fn lost(args: &Calibrate, on: On, asked: &[Views], at_truth: &AtTruth) -> Result<Vec<Known>> {
     let options = Options { min_starts: 0, ..Options::of(Effort::Fast) };
     let bar = progress(asked.len() as u64, "wrong poses");
     let mut lost = Vec::new();
@@ -166,7 +188,8 @@ fn lost(args: &Calibrate, on: On, asked: &[Views], at_truth: &BTreeMap<String, f
         };
         let starts = pictures.iter().zip(truths).map(far).collect::<Result<Vec<_>>>()?;
         let found = args.search.run(&options, on, pictures, &starts, |_| Ok(()))?;
-        let known = found.iter().zip(truths).map(|(found, truth)| Known::of(found, truth, at_truth.get(name)));
+        let views = found.iter().zip(truths).zip(pictures);
+        let known = views.map(|((found, truth), picture)| Known::of(found, truth, at_truth.of_others(name, &picture.name)));
         // Rivals are those of a search that is not hindered.
         lost.extend(known.filter(Known::has_failed).map(|known| Known { rival: f64::INFINITY, ..known }));
         bar.inc(1);
@@ -247,6 +270,16 @@ fn limits(known: &[Known], lost: &[Known]) -> Limits {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_view_is_held_against_the_others_of_its_object() {
+        let parts = |values: &[(&str, f64)]| values.iter().map(|(name, part)| (name.to_string(), *part)).collect();
+        let chair = parts(&[("0", 0.1), ("1", 0.3), ("2", 0.2)]);
+        let at_truth = AtTruth([("chair".to_string(), chair), ("stool".to_string(), parts(&[("0", 0.4)]))].into());
+        assert_eq!(["0", "1"].map(|view| at_truth.of_others("chair", view)), [Some(0.3), Some(0.2)]);
+        assert_eq!([at_truth.of_others("stool", "0"), at_truth.of_others("table", "0")], [None, None]);
+        assert_eq!(at_truth.most(), [("chair".to_string(), 0.3)].into());
+    }
 
     /// Of an instance whose true poses leave a tenth unexplained at most.
     fn known(rotation_deg: f64, unexplained: f64, rival: f64) -> Known {
