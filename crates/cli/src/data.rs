@@ -11,7 +11,7 @@ use srn_data::formats::{self, Format, ReadOptions, WriteOptions, Written, bop};
 use srn_data::inspect::{self, Origin};
 use srn_data::target::MARGIN;
 
-use crate::common::{Result, axes, named, progress};
+use crate::common::{Result, axes, named, progress, refuse_existing};
 use crate::meshes;
 
 /// Flags that say what a source is, and how it differs from what its format promises.
@@ -230,13 +230,6 @@ fn report(capture: &Capture, written: &Written, note: &str) {
     println!("{}: {} views written, {} skipped; {note}", written.dir.display(), written.views, skipped.len());
 }
 
-fn refuse_existing(mut paths: impl Iterator<Item = PathBuf>, force: bool) -> Result<()> {
-    match paths.find(|path| !force && path.exists()) {
-        Some(path) => Err(format!("{}: exists already; --force replaces it", path.display()).into()),
-        None => Ok(()),
-    }
-}
-
 fn folder_name(name: &str) -> Result<String> {
     match name {
         "" | "." | ".." => Err(format!("\"{name}\" cannot name a folder").into()),
@@ -348,7 +341,7 @@ impl Export {
             return Err(format!("{}: no view of {} has a pose there", self.path.display(), show(self.poses.as_deref())).into());
         }
         let Target::Format(format) = self.format else {
-            refuse_existing([self.out.clone()].into_iter(), self.force)?;
+            refuse_existing([self.out.clone()], self.force)?;
             bop::write_results(&self.out, &results, self.force)?;
             println!("{}: {} estimates", self.out.display(), results.len());
             return Ok(true);

@@ -12,7 +12,7 @@ use srn_data::srn::{InstanceWriter, Intrinsics};
 use srn_data::{camera, ldraw, sheet};
 use srn_gpu::raster::{self, Rasterizer};
 
-use crate::common::{Result, progress};
+use crate::common::{Result, progress, refuse_existing};
 use crate::sets::{Cache, Set};
 
 /// Flags of `sigma-data render`.
@@ -138,7 +138,7 @@ impl Render {
             }
             jobs.push((name, path, [folder(name)]));
         }
-        self.refuse_existing(jobs.iter().map(|(.., [folder])| &folder.dir))?;
+        refuse_existing(jobs.iter().map(|(.., [folder])| folder.dir.clone()), self.force)?;
         // All are read before anything is written.
         let meshes = jobs.iter().map(|(_, path, _)| load_mesh(path, self.up)).collect::<Result<Vec<_>>>()?;
         let studio = self.studio(1.3, jobs.len() * self.views as usize)?;
@@ -176,7 +176,7 @@ impl Render {
         }
         let sheet_file = self.out.join("sheet.png");
         let dirs = jobs.iter().flat_map(|(_, folders, _)| folders).map(|folder| &folder.dir);
-        self.refuse_existing(dirs.chain([&sheet_file]))?;
+        refuse_existing(dirs.chain([&sheet_file]).cloned(), self.force)?;
         let pictures = jobs.iter().flat_map(|(_, folders, _)| folders).map(|folder| folder.views).sum();
         let studio = self.studio(set.radius(), pictures)?;
         let (mut counts, mut skipped, mut cells) = ([0; 2], 0, vec![]);
@@ -210,13 +210,6 @@ impl Render {
         println!("{out}/heldout: {held_out} instances of {test_views} views");
         println!("{}: a view of each object; {skipped} skipped", sheet_file.display());
         Ok(())
-    }
-
-    fn refuse_existing<'a>(&self, mut paths: impl Iterator<Item = &'a PathBuf>) -> Result<()> {
-        match paths.find(|path| !self.force && path.exists()) {
-            Some(path) => Err(format!("{}: exists already; --force replaces it", path.display()).into()),
-            None => Ok(()),
-        }
     }
 
     fn studio(&self, usual_radius: f64, pictures: usize) -> Result<Studio<'_>> {

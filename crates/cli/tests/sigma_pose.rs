@@ -542,8 +542,9 @@ fn a_baked_model_is_a_model() {
     let line = run(dir, "bake --model model.safetensors --instance chicken --out chicken.safetensors", 0);
     assert!(line.contains("chicken.safetensors: chicken, 0.0"), "{line}");
     let models = ["model", "chicken"];
-    let pictures = models.map(|model| {
-        run(dir, &format!("render --model {model}.safetensors --instance chicken --executor cpu --out {model}.png"), 0);
+    // Its only object need not be named, also for a picture that does not lie in an SRN folder.
+    let pictures = [("model", "--instance chicken"), ("chicken", "")].map(|(model, named)| {
+        run(dir, &format!("render --model {model}.safetensors {named} --executor cpu --out {model}.png"), 0);
         image::open(dir.join(model).with_extension("png")).unwrap().into_rgb8()
     });
     let apart = pictures[0].as_raw().iter().zip(pictures[1].as_raw()).map(|(a, b)| a.abs_diff(*b)).max();
@@ -555,6 +556,10 @@ fn a_baked_model_is_a_model() {
     });
     let (rotation, translation) = pose_error(&poses[0], &poses[1]);
     assert!(rotation < 0.01 && translation < 1e-4, "{rotation}° {translation}");
+    fs::copy(dir.join("model.png"), dir.join("photo.png")).unwrap();
+    let photo = "estimate photo.png --fov 46.5 --executor cpu --steps 1 --accept 1e9 --model";
+    fail(dir, &format!("{photo} model.safetensors"), &["photo.png", "which object", "--instance"]);
+    assert!(run(dir, &format!("{photo} chicken.safetensors"), 0).contains("photo"));
     let evaluate = "evaluate --model chicken.safetensors --data DATA --views 1 --steps 2 --executor cpu";
     assert!(run(dir, evaluate, 0).contains("chicken"));
 

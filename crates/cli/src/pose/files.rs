@@ -25,7 +25,8 @@ pub struct ObjectArgs {
     /// Model, or checkpoint of a training run.
     #[arg(long, value_name = "FILE")]
     pub model: PathBuf,
-    /// Name or number of the object in the pictures. Default: the name of the SRN folder that a picture lies in.
+    /// Name or number of the object in the pictures. Default: the name of the SRN folder that a picture lies in, else the model's
+    /// only one.
     #[arg(long, value_name = "NAME")]
     pub instance: Option<String>,
     #[command(flatten)]
@@ -95,6 +96,15 @@ impl PoseSource {
     }
 }
 
+/// Number of the instance that is named, or of the model's only one.
+pub fn instance_of(model: &Model, name: Option<&str>) -> Result<u32> {
+    match name {
+        Some(name) => Ok(model.instance(name)?),
+        None if model.layout.instances == 1 => Ok(0),
+        None => Err("which object is it? Give --instance".into()),
+    }
+}
+
 /// The instance folder of a picture `INSTANCE/rgb/NAME.png`.
 pub fn srn_instance(picture: &Path) -> Option<PathBuf> {
     let path = std::fs::canonicalize(picture).ok()?;
@@ -146,8 +156,7 @@ impl Picture {
             (None, None) => return Err(about("no intrinsics: give --focal, --fov or --intrinsics").into()),
         };
         let folder = dir.as_deref().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
-        let instance = instance.map(String::from).or(folder).ok_or_else(|| about("which object is it? Give --instance"))?;
-        let instance = model.instance(&instance)?;
+        let instance = instance_of(model, instance.or(folder.as_deref())).map_err(|error| about(&error.to_string()))?;
         let read = if dir.is_some() { Target::of_view } else { Target::of_photo };
         let target = read(path, mask, &intrinsics, side as usize)?;
         let [fx, fy, cx, cy] = target.intrinsics.map(f64::from);

@@ -11,7 +11,7 @@ use srn_data::pixels::rgb8;
 use srn_data::sheet::VIRIDIS;
 use srn_data::srn::{self, InstanceWriter, read_pose};
 
-use super::files::{CameraArgs, write_gif, write_png};
+use super::files::{CameraArgs, instance_of, write_gif, write_png};
 use super::notation::NotationArgs;
 use super::search::{On, render};
 use super::{draw, positive};
@@ -28,9 +28,9 @@ pub struct Render {
     /// Model, or checkpoint of a training run.
     #[arg(long, value_name = "FILE")]
     model: PathBuf,
-    /// Name or number of the object.
+    /// Name or number of the object. Default: the model's only one.
     #[arg(long, value_name = "NAME")]
-    instance: String,
+    instance: Option<String>,
     /// Picture (.png), animation (.gif), or folder: an SRN instance with pictures, poses and intrinsics.
     #[arg(long, value_name = "FILE|DIR")]
     out: PathBuf,
@@ -74,7 +74,7 @@ fn angle(text: &str) -> std::result::Result<f64, String> {
 /// Runs the command.
 pub fn run(args: &Render) -> Result<bool> {
     let model = load_model(&args.model)?;
-    let instance = model.instance(&args.instance)?;
+    let instance = instance_of(&model, args.instance.as_deref())?;
     let kind = args.out.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match (kind.as_str(), args.orbit) {
         ("gif", None) => return Err(format!("{}: an animation needs --orbit", args.out.display()).into()),
