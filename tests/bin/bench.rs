@@ -22,6 +22,8 @@ const ADAM: Method = Method::Adam { loss: Loss::Mae, learning_rate: 0.01 };
 /// Bytes for a training by width: an eighth of the default; at the paper's width half, since parameters, gradients and Adam's
 /// moments alone take 0.9 GB.
 const SMALL_BUDGETS: [(u32, u64); 2] = [(64, 256 << 20), (256, 1 << 30)];
+/// Rows of a tile where the CPU's kernels are timed alone: with some hundred, as they run, starting the threads would count most.
+const ALONE_ROWS: u32 = 4096;
 /// Hypotheses and side of the image, from one to the other end of what is asked for.
 const SCALING: [(u32, u32); 8] = [(5, 16), (5, 32), (5, 64), (5, 128), (1, 32), (5, 32), (24, 32), (120, 32)];
 
@@ -101,6 +103,11 @@ fn run() -> Result<()> {
         for engine in &engines {
             let mut bench = Bench { engine, model: &model, runs, ceilings: &mut ceilings };
             let (row, mut descent) = bench.pose_step(ADAM, BATCH, SIDE)?;
+            if engine.as_gpu().is_none() {
+                let engine = engine.clone().with_tile_rows(ALONE_ROWS);
+                let mut alone = Bench { engine: &engine, model: &model, runs: 1, ceilings: &mut Vec::new() };
+                descent = alone.pose_step(ADAM, BATCH, SIDE)?.1;
+            }
             kernels.extend(profile(&mut descent, width, name(engine))?);
             drop(descent);
             let before = rows.len();

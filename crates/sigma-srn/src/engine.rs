@@ -12,11 +12,13 @@ use crate::network::Purpose;
 
 /// Memory that a plan may take on the CPU where the user sets no budget, in bytes.
 const CPU_BUDGET: u64 = 2 << 30;
-/// Values of one layer of a tile on the CPU, by a software adapter, or where gradients of weights are summed over its rows: large enough
-/// to keep the threads busy, small enough to stay in the caches.
-const CPU_TILE_VALUES: u32 = 1 << 18;
+/// Values of one layer of a tile on the CPU where gradients of weights are summed over its rows: large enough for the sums, small enough for
+/// the caches.
+const TRAINING_TILE_VALUES: u32 = 1 << 18;
 /// Rows of a tile on a GPU: enough to fill a large one.
 const GPU_TILE_ROWS: u32 = 32_768;
+/// The same for a software adapter.
+const SOFTWARE_TILE_ROWS: u32 = 4096;
 
 /// What computes.
 #[derive(Clone, Debug)]
@@ -118,10 +120,13 @@ impl Engine {
     ) -> Result<(Plan, T), Error> {
         let for_all_threads = srn_cpu::rows_for_all_threads(features as usize) as u32;
         let preferred = self.tile_rows.unwrap_or(match &self.kind {
-            Kind::Gpu(gpu) if !gpu.adapter().is_software => GPU_TILE_ROWS,
+            Kind::Gpu(gpu) if gpu.adapter().is_software => SOFTWARE_TILE_ROWS,
+            Kind::Gpu(_) => GPU_TILE_ROWS,
+            Kind::Cpu | Kind::CpuF64 if purpose == Purpose::Train => {
+                (TRAINING_TILE_VALUES / features.max(1)).max(2 * for_all_threads)
+            }
             // What is kept for the way back stays in the caches.
-            Kind::Cpu | Kind::CpuF64 if purpose != Purpose::Train => for_all_threads,
-            Kind::Gpu(_) | Kind::Cpu | Kind::CpuF64 => (CPU_TILE_VALUES / features.max(1)).max(2 * for_all_threads),
+            Kind::Cpu | Kind::CpuF64 => for_all_threads,
         });
         let mut tile_rows = rows.min(preferred).max(1);
         loop {
