@@ -149,6 +149,8 @@ fn an_object_is_found_without_its_name() {
         println!("instance {instance}: began with {}, {error:.2}° off, colours {apart:.1e} apart", found.nearest);
         assert_eq!((found.nearest, found.model.layout.instances), (instance, 1));
         assert!(error < 6.0 && apart < 0.2, "{error}° {apart}");
+        let ranking = &found.estimate.ranking;
+        assert!(ranking.is_sorted_by(|a, b| a.loss <= b.loss) && ranking[0].loss == found.estimate.loss, "{ranking:?}");
         assert_eq!((turns[0], turns.last()), ((0, turns.len()), Some(&(turns.len() - 1, turns.len()))));
     }
 }

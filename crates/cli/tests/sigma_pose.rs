@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use glam::DMat4;
 use serde_json::Value;
 use sigma_srn::camera::pose_error;
-use sigma_srn::{Metadata, Model, ModelConfig};
+use sigma_srn::{Calibration, Metadata, Model, ModelConfig};
 use tempfile::TempDir;
 
 const TEST: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/dataset/test");
@@ -532,6 +532,33 @@ fn a_mask_takes_pixels_out_of_the_search() {
     fail_with("--fov 53.5 --instance seat --mask black.png", &["black.png", "nothing"]);
     image::GrayImage::new(8, 8).save(dir.join("small.png")).unwrap();
     fail_with("--fov 53.5 --instance seat --mask small.png", &["small.png", "8×8"]);
+}
+
+/// An object that the model was not trained on: no deviations, which are those of known objects, and where it may as well be another one
+/// in another pose, no trust.
+#[test]
+fn an_unknown_object_has_no_known_deviations() {
+    let home = home();
+    let dir = home.path();
+    let mut model = Model::load(&dir.join("model.safetensors")).unwrap();
+    let (curvature, floor, unexplained) = (1.0, [1.0; 6], 1e9);
+    let calibration = Calibration { curvature, floor, unexplained, at_truth: [].into(), above_truth: 1.0, rival: 0.0, views: 9 };
+    model.metadata.calibration = Some(calibration);
+    model.save(&dir.join("model.safetensors")).unwrap();
+    let args = format!("estimate DATA/{CHICKEN} --model model.safetensors --executor cpu --unseen --json");
+    let first = |args: &str, code| -> Value {
+        let report: Value = serde_json::from_str(&run(dir, args, code)).unwrap();
+        report["images"][0].clone()
+    };
+    // Three networks that know nothing explain the picture about as badly as each other.
+    let found = first(&args, 1);
+    let losses: Vec<f64> = found["ranking"].as_array().unwrap().iter().map(|r| r["loss"].as_f64().unwrap()).collect();
+    assert!(losses.len() == 3 && losses.is_sorted() && losses[0] == found["loss"].as_f64().unwrap(), "{found}");
+    assert!(found["rival"]["higher"].as_f64().unwrap() < 0.3 && found["trusted"] == false, "{found}");
+    assert!(found["confidence"].is_null(), "{found}");
+    let found = first(&format!("{args} --accept 9 --save-model new.safetensors"), 0);
+    assert_eq!(found["trusted"], true);
+    assert_eq!(Model::load(&dir.join("new.safetensors")).unwrap().metadata.instance_names, ["unseen"]);
 }
 
 /// One object alone: the same picture, the same poses, wherever a model goes.

@@ -3,7 +3,7 @@
 
 use glam::DMat4;
 
-use crate::estimator::{Estimate, Options, Phase, Query, estimate};
+use crate::estimator::{Estimate, Options, Phase, Query, Ranked, estimate};
 use crate::random::stream;
 use crate::trainer::{Train, Trainer, TrainingBatch};
 use crate::{Engine, Error, Model, Rays, pixel_grid};
@@ -65,10 +65,15 @@ pub fn estimate_unseen(
         estimates = estimate(engine, &fitted, &queries, &options(phases), |_| Ok(()))?;
         poses = estimates.iter().map(|estimate| estimate.pose.to_matrix()).collect();
     }
-    let best = (0..estimates.len()).min_by(|&a, &b| estimates[a].loss.total_cmp(&estimates[b].loss)).unwrap_or(0);
+    let mut by_loss: Vec<usize> = (0..estimates.len()).collect();
+    by_loss.sort_by(|&a, &b| estimates[a].loss.total_cmp(&estimates[b].loss));
+    let best = by_loss[0];
     let mut model = fitted.with_new_instances(vec!["unseen".into()])?;
     model.parameters[codes].values = fitted.parameters[codes].values[best * latent..][..latent].to_vec();
-    Ok(Unseen { estimate: estimates.swap_remove(best), model, nearest: order[best] as u32 })
+    // Each went on from another known object: where they end in different poses, the object may be one thing here or another there.
+    let ranked = |k: usize| Ranked { start: looks[order[k]].ranking[0].start, ..estimates[k].ranking[0] };
+    let ranking = by_loss.into_iter().map(ranked).collect();
+    Ok(Unseen { estimate: Estimate { ranking, ..estimates.swap_remove(best) }, model, nearest: order[best] as u32 })
 }
 
 /// Fits the codes of all instances to the image, each from its own pose.

@@ -21,6 +21,8 @@ use crate::common::Result;
 
 /// What `--accept` is for a model without a calibration.
 const ACCEPT: f64 = 0.25;
+/// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on (`docs/accuracy.md`).
+const UNSEEN_RIVAL: f64 = 0.3;
 /// Views that are rendered at once.
 const RENDER_BATCH: usize = 8;
 
@@ -66,7 +68,7 @@ pub struct SearchArgs {
     seed: u64,
     /// A pose is trusted if the view from there leaves at most this part of the picture unexplained: the sum of absolute differences, over
     /// that to an empty picture. Default: what `calibrate` has found for the model, else 0.25. With the default, what looks alike from two
-    /// sides is not trusted either if `calibrate` saw the search mistake them.
+    /// sides is not trusted either if `calibrate` saw the search mistake them, or if the object is not one of the model's.
     #[arg(long, value_name = "X", value_parser = positive)]
     accept: Option<f64>,
     /// Distance of the starts of `around84` and `fixed24` from the object's centre, in object units. Default: by the size of the object in a
@@ -221,7 +223,10 @@ impl SearchArgs {
         let seconds = began.elapsed().as_secs_f64();
         let view = (0, estimate.pose.to_matrix(), picture.intrinsics);
         let render = render(On { model: &model, ..on }, &[view])?.swap_remove(0);
-        Ok((self.found(&model, picture, estimate, render, seconds), model))
+        let found = self.found(&model, picture, estimate, render, seconds);
+        let trusted = self.trusts_unseen(&model, &found);
+        // The deviations that `calibrate` has found are those of known objects.
+        Ok((Found { trusted, confidence: None, ..found }, model))
     }
 
     fn found(&self, model: &Model, picture: &Picture, estimate: Estimate, render: Rendering, seconds: f64) -> Found {
@@ -243,6 +248,15 @@ impl SearchArgs {
             }
             (None, None) => explains(ACCEPT),
         }
+    }
+
+    /// The same for an object that the model was not trained on: its code bends to the picture at a wrong pose too, so what matters more than
+    /// what is unexplained is whether the other known objects that it began with led to the same pose.
+    fn trusts_unseen(&self, model: &Model, found: &Found) -> bool {
+        let most =
+            self.accept.or(model.metadata.calibration.as_ref().map(|calibration| calibration.unexplained)).unwrap_or(ACCEPT);
+        let is_alone = self.accept.is_some() || found.estimate.rival().is_none_or(|(_, higher)| higher >= UNSEEN_RIVAL);
+        found.estimate.loss.is_finite() && found.unexplained <= most && is_alone
     }
 
     /// Starts all around the object, turned so that it appears in the middle of the picture: a cut may lie anywhere beside the
