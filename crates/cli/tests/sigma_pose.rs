@@ -542,7 +542,8 @@ fn an_unknown_object_has_no_known_deviations() {
     let dir = home.path();
     let mut model = Model::load(&dir.join("model.safetensors")).unwrap();
     let (curvature, floor, unexplained) = (1.0, [1.0; 6], 1e9);
-    let calibration = Calibration { curvature, floor, unexplained, at_truth: [].into(), above_truth: 1.0, rival: 0.0, views: 9 };
+    let (sizes, at_truth) = ([].into(), [].into());
+    let calibration = Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth: 1.0, rival: 0.0, views: 9 };
     model.metadata.calibration = Some(calibration);
     model.save(&dir.join("model.safetensors")).unwrap();
     let args = format!("estimate DATA/{CHICKEN} --model model.safetensors --executor cpu --unseen --json");

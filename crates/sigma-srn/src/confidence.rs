@@ -11,16 +11,27 @@ use crate::estimator::{Estimate, Ranked};
 /// A symmetric matrix over a motion, see [`motion`].
 pub type Matrix6 = [[f64; 6]; 6];
 
-/// The motion from an estimate to the true pose, and the estimate's [`Estimate::shape`].
-pub type Known = ([f64; 6], Matrix6);
+/// An estimate whose true pose is known.
+#[derive(Clone, Debug)]
+pub struct Known {
+    /// Name of the object.
+    pub instance: String,
+    /// From the estimate to the true pose, see [`motion`].
+    pub motion: [f64; 6],
+    /// See [`Estimate::shape`].
+    pub shape: Matrix6,
+}
 
 /// What estimates of known poses told of a model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// The covariance of an estimate is this times `loss · B⁻¹`,
     pub curvature: f64,
-    /// and these variances on its diagonal: what the errors of all estimates have in common.
+    /// and these variances on its diagonal: what the errors of all estimates have in common;
     pub floor: [f64; 6],
+    /// by instance, so many times both together, where the errors at one object tell of those at another view of it. Others: 1.
+    #[serde(default)]
+    pub sizes: BTreeMap<String, f64>,
     /// Part of a picture that an estimate to be trusted leaves unexplained at most.
     pub unexplained: f64,
     /// By instance, the part of a picture that its true poses leave unexplained at most: the network knows one object better than another.
@@ -73,14 +84,16 @@ impl Estimate {
         Some(std::array::from_fn(|i| std::array::from_fn(|j| self.loss * entry(i, j))))
     }
 
-    /// Covariance of the motion from the estimated pose to the true one; `None` where there is no [`Estimate::shape`].
-    pub fn covariance(&self, calibration: &Calibration) -> Option<Matrix6> {
-        Some(mixed(&self.shape()?, calibration.curvature, &calibration.floor))
+    /// Covariance of the motion from the estimated pose of this instance to the true one; `None` where there is no [`Estimate::shape`].
+    pub fn covariance(&self, instance: &str, calibration: &Calibration) -> Option<Matrix6> {
+        let size = calibration.sizes.get(instance).copied().unwrap_or(1.0);
+        let mixed = mixed(&self.shape()?, calibration.curvature, &calibration.floor);
+        Some(mixed.map(|row| row.map(|entry| size * entry)))
     }
 
-    /// Whether a pose lies within the ellipsoid that 95 % of all true poses lie in, if the errors are normal.
-    pub fn states(&self, pose: &DMat4, calibration: &Calibration) -> Option<bool> {
-        let (_, squared) = distance(&self.covariance(calibration)?, &motion(&self.pose.to_matrix(), pose))?;
+    /// Whether a pose lies within the ellipsoid that 95 % of all true poses of this instance lie in, if the errors are normal.
+    pub fn states(&self, pose: &DMat4, instance: &str, calibration: &Calibration) -> Option<bool> {
+        let (_, squared) = distance(&self.covariance(instance, calibration)?, &motion(&self.pose.to_matrix(), pose))?;
         Some(squared <= WITHIN_95)
     }
 
@@ -96,34 +109,72 @@ impl Estimate {
     }
 }
 
-/// `curvature` and `floor` of a [`Calibration`], from motions to the true poses and the shapes of their estimates: the most likely mixture of
-/// what depends on the view and what does not, then enlarged until 95 % of the motions lie within the ellipsoids that say so.
-pub fn fit(known: &[Known]) -> Option<(f64, [f64; 6])> {
+/// `curvature`, `floor` and `sizes` of a [`Calibration`]: the most likely mixture of what depends on the view and what does not, and what the
+/// errors at each object say of the next one there; then enlarged until 95 % of the motions lie within the ellipsoids that say so.
+pub fn fit(known: &[Known]) -> Option<(f64, [f64; 6], BTreeMap<String, f64>)> {
     let count = known.len() as f64;
     let mean = |of: &dyn Fn(&Known) -> f64| known.iter().map(of).sum::<f64>() / count;
-    let squares: [f64; 6] = std::array::from_fn(|k| mean(&|(motion, _)| motion[k] * motion[k]));
+    let squares: [f64; 6] = std::array::from_fn(|k| mean(&|known| known.motion[k] * known.motion[k]));
     // Either part alone is as large as the errors are: the mixture is looked for between them and a thousandth.
-    let whole = mean(&|(motion, shape)| distance(shape, motion).map_or(f64::NAN, |(_, squared)| squared / 6.0));
+    let whole = mean(&|known| distance(&known.shape, &known.motion).map_or(f64::NAN, |(_, squared)| squared / 6.0));
     if squares.contains(&0.0) || !whole.is_finite() {
         return None;
     }
     let parts = || std::iter::once(0.0).chain((0..=24).map(|k| 10f64.powf(-3.0 + f64::from(k) / 8.0)));
     let distances = |a: f64, b: f64| -> Option<Vec<(f64, f64)>> {
         let floor = squares.map(|square| b * square);
-        known.iter().map(|(motion, shape)| distance(&mixed(shape, a * whole, &floor), motion)).collect()
+        known.iter().map(|known| distance(&mixed(&known.shape, a * whole, &floor), &known.motion)).collect()
     };
     let unlikely =
         |distances: &[(f64, f64)]| distances.iter().map(|(log_determinant, squared)| log_determinant + squared).sum::<f64>();
     let mixtures = parts().flat_map(|a| parts().map(move |b| (a, b)));
     let likely = mixtures.filter_map(|(a, b)| distances(a, b).map(|distances| (unlikely(&distances), a, b)));
     let (_, a, b) = likely.min_by(|one, other| one.0.total_cmp(&other.0))?;
-    let mut squared: Vec<f64> = distances(a, b)?.into_iter().map(|(_, squared)| squared).collect();
+    let squared: Vec<f64> = distances(a, b)?.into_iter().map(|(_, squared)| squared).collect();
+    let factor = within_95(squared.clone());
+    let (sizes, of_others) = sizes(known, &squared);
+    let of_each = within_95(squared.iter().zip(&of_others).map(|(squared, size)| squared / size).collect());
+    let sizes = sizes.into_iter().map(|(instance, size)| (instance, size * of_each / factor)).collect();
+    Some((factor * a * whole, squares.map(|square| factor * b * square), sizes))
+}
+
+/// By how much ellipsoids are to be enlarged for 95 % of these squared distances to lie within, and of the next one.
+fn within_95(mut squared: Vec<f64>) -> f64 {
     squared.sort_by(f64::total_cmp);
     // The next one is as likely to lie anywhere between these: below the rank that 95 % of n + 1 are.
-    let rank = (0.95 * (count + 1.0)).ceil() as usize;
+    let rank = (0.95 * (squared.len() as f64 + 1.0)).ceil() as usize;
     // The view of that rank itself lies within, however the ellipsoid is rounded.
-    let factor = (1.0 + 1e-9) * squared[rank.min(squared.len()) - 1] / WITHIN_95;
-    Some((factor * a * whole, squares.map(|square| factor * b * square)))
+    (1.0 + 1e-9) * squared[rank.min(squared.len()) - 1] / WITHIN_95
+}
+
+/// How large the squared distances at each object are, drawn to the mean of all by as many views more as make those left out one by one the
+/// most likely; none if each object is like all. With them, for each view, the size by the other views of its object.
+fn sizes(known: &[Known], squared: &[f64]) -> (BTreeMap<String, f64>, Vec<f64>) {
+    let mean = squared.iter().sum::<f64>() / squared.len() as f64;
+    let mut sums = BTreeMap::<&str, (f64, f64)>::new();
+    for (known, squared) in known.iter().zip(squared) {
+        let (views, sum) = sums.entry(&known.instance).or_default();
+        (*views, *sum) = (*views + 1.0, *sum + squared);
+    }
+    let alike = vec![1.0; known.len()];
+    let of_others = |more: f64| -> Vec<f64> {
+        let of = |(known, squared): (&Known, &f64)| {
+            let (views, sum) = sums[&*known.instance];
+            (more + (sum - squared) / mean) / (more + views - 1.0)
+        };
+        known.iter().zip(squared).map(of).collect()
+    };
+    let unlikely = |sizes: &[f64]| {
+        sizes.iter().zip(squared).map(|(size, squared)| 6.0 * size.ln() + 6.0 * squared / mean / size).sum::<f64>()
+    };
+    let candidates = (0..=5).map(|k| f64::from(1 << k)).map(|more| (more, of_others(more)));
+    match candidates.min_by(|(_, one), (_, other)| unlikely(one).total_cmp(&unlikely(other))) {
+        Some((more, of_others)) if unlikely(&of_others) < unlikely(&alike) => {
+            let size = |(views, sum): (f64, f64)| (more + sum / mean) / (more + views);
+            (sums.into_iter().map(|(instance, sums)| (instance.to_string(), size(sums))).collect(), of_others)
+        }
+        _ => (BTreeMap::new(), alike),
+    }
 }
 
 /// Standard deviations of an estimate: of the turn in degrees, and of the camera's place in object units; each the root of the sum over
@@ -222,7 +273,8 @@ mod tests {
     }
 
     fn calibration(curvature: f64, floor: [f64; 6]) -> Calibration {
-        Calibration { curvature, floor, unexplained: 1.0, at_truth: BTreeMap::new(), above_truth: 0.0, rival: 0.0, views: 1 }
+        let (sizes, at_truth) = (BTreeMap::new(), BTreeMap::new());
+        Calibration { curvature, floor, sizes, unexplained: 1.0, at_truth, above_truth: 0.0, rival: 0.0, views: 1 }
     }
 
     #[test]
@@ -264,14 +316,14 @@ mod tests {
             DMat4::from_mat3_translation(turn * DMat3::from_mat4(pose), turn * pose.w_axis.truncate())
         };
         let edge = (1e-4 * WITHIN_95).sqrt();
-        let states = |angle| estimate.states(&turned(angle), &calibration(0.0, floor));
+        let states = |angle| estimate.states(&turned(angle), "box", &calibration(0.0, floor));
         assert_eq!((states(0.99 * edge), states(1.01 * edge)), (Some(true), Some(false)));
     }
 
     #[test]
     fn deviations_are_those_of_random_motions() {
         let pose = look_at_origin(DVec3::new(1.0, -0.6, 0.5));
-        let covariance = estimate(pose).covariance(&calibration(1e-5, [1e-6; 6])).unwrap();
+        let covariance = estimate(pose).covariance("box", &calibration(1e-5, [1e-6; 6])).unwrap();
         // The sum over the columns of a factor is that over all directions.
         let lower = cholesky(&covariance).unwrap();
         let centre = DMat3::from_mat4(pose).transpose() * pose.w_axis.truncate();
@@ -289,29 +341,54 @@ mod tests {
         );
     }
 
-    /// Errors of both kinds in a known mixture: the fit finds it, and its ellipsoids hold what they should of others like them.
+    /// Errors of both kinds in a known mixture, larger at some objects.
+    fn drawn(count: usize, size_of: impl Fn(usize) -> f64, seed: u64) -> Vec<Known> {
+        let mut random = stream(1, seed);
+        let floor = [4e-4, 1e-4, 1e-4, 1e-5, 1e-5, 4e-5];
+        let one = |k: usize| {
+            let size = 10f64.powf(normal(&mut random));
+            let m = curvature();
+            let shape: Matrix6 = std::array::from_fn(|i| std::array::from_fn(|j| size * m[i][j] * 1e-6));
+            let lower = cholesky(&mixed(&shape, 0.3, &floor)).unwrap();
+            let numbers: [f64; 6] = std::array::from_fn(|_| size_of(k % 100).sqrt() * normal(&mut random));
+            let motion = std::array::from_fn(|i| (0..6).map(|k| lower[i][k] * numbers[k]).sum());
+            Known { instance: (k % 100).to_string(), motion, shape }
+        };
+        (0..count).map(one).collect()
+    }
+
+    /// The part of views that lie within the ellipsoids that the fit of others makes.
+    fn share(found: &(f64, [f64; 6], BTreeMap<String, f64>), others: &[Known]) -> f64 {
+        let (curvature, floor, sizes) = found;
+        let inside = |known: &&Known| {
+            let size = sizes.get(&known.instance).unwrap_or(&1.0);
+            distance(&mixed(&known.shape, *curvature, floor), &known.motion).unwrap().1 <= size * WITHIN_95
+        };
+        others.iter().filter(inside).count() as f64 / others.len() as f64
+    }
+
     #[test]
     fn the_fit_finds_the_mixture() {
-        let mut random = stream(1, 2);
-        let floor = [4e-4, 1e-4, 1e-4, 1e-5, 1e-5, 4e-5];
-        let mut draw = |count: usize| -> Vec<Known> {
-            let one = |_| {
-                let size = 10f64.powf(normal(&mut random));
-                let m = curvature();
-                let shape: Matrix6 = std::array::from_fn(|i| std::array::from_fn(|j| size * m[i][j] * 1e-6));
-                let lower = cholesky(&mixed(&shape, 0.3, &floor)).unwrap();
-                let numbers: [f64; 6] = std::array::from_fn(|_| normal(&mut random));
-                (std::array::from_fn(|i| (0..6).map(|k| lower[i][k] * numbers[k]).sum()), shape)
-            };
-            (0..count).map(one).collect()
+        let found = fit(&drawn(400, |_| 1.0, 2)).unwrap();
+        assert!((0.2..0.45).contains(&found.0), "{found:?}");
+        let share = share(&found, &drawn(2000, |_| 1.0, 3));
+        assert!((0.93..0.97).contains(&share) && found.2.values().all(|size| (0.5..2.0).contains(size)), "{share} {found:?}");
+        let nowhere = Known { instance: "box".into(), motion: [0.0; 6], shape: curvature() };
+        assert_eq!((fit(&[]), fit(&[nowhere])), (None, None));
+    }
+
+    #[test]
+    fn an_object_that_is_known_badly_has_an_ellipsoid_of_its_own() {
+        let size_of = |k: usize| if k < 10 { 16.0 } else { 1.0 };
+        let found = fit(&drawn(600, size_of, 4)).unwrap();
+        let of = |bad: bool| -> Vec<Known> {
+            drawn(4000, size_of, 5).into_iter().filter(|known| (known.instance.len() == 1) == bad).collect()
         };
-        let (known, others) = (draw(400), draw(2000));
-        let (curvature, found) = fit(&known).unwrap();
-        assert!((0.2..0.45).contains(&curvature), "{curvature}");
-        let inside = |(motion, shape): &&Known| distance(&mixed(shape, curvature, &found), motion).unwrap().1 <= WITHIN_95;
-        let share = others.iter().filter(inside).count() as f64 / 2000.0;
-        assert!((0.93..0.97).contains(&share), "{share} {curvature} {found:?}");
-        assert_eq!((fit(&[]), fit(&[([0.0; 6], self::curvature())])), (None, None));
+        let (bad, good) = (share(&found, &of(true)), share(&found, &of(false)));
+        assert!((0.8..1.0).contains(&bad) && (0.93..0.98).contains(&good), "{bad} {good} {found:?}");
+        // One ellipsoid for all would leave most of them out.
+        let alike = (found.0, found.1, BTreeMap::new());
+        assert!(share(&alike, &of(true)) < 0.75, "{}", share(&alike, &of(true)));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use glam::DMat4;
-use sigma_srn::confidence::{Matrix6, fit, motion};
+use sigma_srn::confidence::{self, Matrix6, fit, motion};
 use sigma_srn::{Calibration, Effort, Options};
 
 use super::files::Picture;
@@ -59,8 +59,9 @@ pub struct Calibrate {
 }
 
 /// A search whose true pose is known.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 struct Known {
+    instance: String,
     rotation_deg: f64,
     /// From the estimate to the truth.
     motion: [f64; 6],
@@ -74,8 +75,9 @@ struct Known {
 }
 
 impl Known {
-    fn of(found: &Found, truth: &DMat4, at_truth: Option<f64>) -> Self {
+    fn of(instance: &str, found: &Found, truth: &DMat4, at_truth: Option<f64>) -> Self {
         Known {
+            instance: instance.into(),
             rotation_deg: PoseError::of(&found.world_from_camera, truth).rotation_deg,
             motion: motion(&found.world_from_camera, truth),
             shape: found.estimate.shape(),
@@ -107,7 +109,9 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     let mut known = Vec::new();
     for (Views { name, pictures, truths, .. }, found) in asked.iter().zip(&found) {
         let views = found.iter().zip(truths).zip(pictures);
-        known.extend(views.map(|((found, truth), picture)| Known::of(found, truth, at_truth.of_others(name, &picture.name))));
+        known.extend(
+            views.map(|((found, truth), picture)| Known::of(name, found, truth, at_truth.of_others(name, &picture.name))),
+        );
     }
     let lost = lost(args, on, &asked, &at_truth)?;
     let calibration =
@@ -118,7 +122,7 @@ pub fn run(args: &Calibrate) -> Result<bool> {
         print(&serde_json::to_string_pretty(&calibration)?)?;
     } else {
         let failures = known.iter().filter(|known| known.has_failed()).count();
-        let Calibration { curvature, floor, unexplained, above_truth, rival, views, .. } = calibration;
+        let Calibration { curvature, floor, sizes, unexplained, above_truth, rival, views, .. } = calibration;
         let (far, lost) = (PoseError::FAILURE_DEG, lost.len());
         print(&format!(
             "{views} views, {failures} of them more than {far}° off; {lost} wrong poses by searches begun far from the truth"
@@ -127,6 +131,10 @@ pub fn run(args: &Calibrate) -> Result<bool> {
         let [a, b, c] = [0, 1, 2].map(|k| floor[k].sqrt().to_degrees());
         let [x, y, z] = [3, 4, 5].map(|k| floor[k].sqrt());
         print(&format!("and in all views ± {a:.2}° {b:.2}° {c:.2}° about the camera's axes, ± {x:.4} {y:.4} {z:.4} along them"))?;
+        if let Some((least, most)) = least_and_most(sizes.values()) {
+            let [least, most] = [least, most].map(|size| size.sqrt());
+            print(&format!("of each object by its own errors, {least:.2} to {most:.2} times these deviations"))?;
+        }
         print(&format!(
             "trusted: at most {:.1} % unexplained, {above_truth:.1} times what true poses of the object leave, and a loss {:.1} % higher elsewhere",
             100.0 * unexplained,
@@ -172,6 +180,10 @@ impl AtTruth {
     }
 }
 
+fn least_and_most<'a>(sizes: impl Iterator<Item = &'a f64> + Clone) -> Option<(f64, f64)> {
+    Some((sizes.clone().copied().min_by(f64::total_cmp)?, most(sizes)?))
+}
+
 fn most<'a>(parts: impl Iterator<Item = &'a f64>) -> Option<f64> {
     parts.copied().max_by(f64::total_cmp)
 }
@@ -189,7 +201,7 @@ fn lost(args: &Calibrate, on: On, asked: &[Views], at_truth: &AtTruth) -> Result
         let starts = pictures.iter().zip(truths).map(far).collect::<Result<Vec<_>>>()?;
         let found = args.search.run(&options, on, pictures, &starts, |_| Ok(()))?;
         let views = found.iter().zip(truths).zip(pictures);
-        let known = views.map(|((found, truth), picture)| Known::of(found, truth, at_truth.of_others(name, &picture.name)));
+        let known = views.map(|((found, truth), picture)| Known::of(name, found, truth, at_truth.of_others(name, &picture.name)));
         // Rivals are those of a search that is not hindered.
         lost.extend(known.filter(Known::has_failed).map(|known| Known { rival: f64::INFINITY, ..known }));
         bar.inc(1);
@@ -201,10 +213,12 @@ fn lost(args: &Calibrate, on: On, asked: &[Views], at_truth: &AtTruth) -> Result
 /// What the searches tell of others. `None` if none of them has second derivatives and found its pose.
 fn calibration(known: &[Known], lost: &[Known], at_truth: BTreeMap<String, f64>) -> Option<Calibration> {
     let found = known.iter().filter(|known| !known.has_failed());
-    let errors: Vec<_> = found.filter_map(|known| known.shape.map(|shape| (known.motion, shape))).collect();
-    let (curvature, floor) = fit(&errors)?;
+    let error = |Known { instance, motion, shape, .. }: &Known| {
+        Some(confidence::Known { instance: instance.clone(), motion: *motion, shape: (*shape)? })
+    };
+    let (curvature, floor, sizes) = fit(&found.filter_map(error).collect::<Vec<_>>())?;
     let Limits { unexplained, above_truth, rival } = limits(known, lost);
-    Some(Calibration { curvature, floor, unexplained, at_truth, above_truth, rival, views: known.len() as u32 })
+    Some(Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth, rival, views: known.len() as u32 })
 }
 
 /// What an estimate to be trusted keeps to, see [`Calibration`].
@@ -284,7 +298,8 @@ mod tests {
     /// Of an instance whose true poses leave a tenth unexplained at most.
     fn known(rotation_deg: f64, unexplained: f64, rival: f64) -> Known {
         let shape = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
-        Known { rotation_deg, motion: [0.01; 6], shape: Some(shape), unexplained, over_truth: unexplained / 0.1, rival }
+        let instance = "chair".to_string();
+        Known { instance, rotation_deg, motion: [0.01; 6], shape: Some(shape), unexplained, over_truth: unexplained / 0.1, rival }
     }
 
     #[test]

@@ -182,7 +182,8 @@ pub(super) fn view_report(
     let errors = found.estimate.ranking.iter().map(|r| error_of(&r.pose.to_matrix()));
     let truth = &symmetries.nearest(truth, &found.world_from_camera);
     let error = error_of(&found.world_from_camera);
-    let within_95 = model.metadata.calibration.as_ref().and_then(|calibration| found.estimate.states(truth, calibration));
+    let within_95 =
+        model.metadata.calibration.as_ref().and_then(|calibration| found.estimate.states(truth, instance, calibration));
     ViewReport {
         instance: instance.into(),
         view: picture.name.clone(),

@@ -232,7 +232,9 @@ impl SearchArgs {
     fn found(&self, model: &Model, picture: &Picture, estimate: Estimate, render: Rendering, seconds: f64) -> Found {
         let unexplained = unexplained(picture, &render.rgb);
         let trusted = self.trusts(model, picture.instance, &estimate, unexplained);
-        let confidence = model.metadata.calibration.as_ref().and_then(|calibration| Confidence::of(&estimate, calibration));
+        let instance = model.instance_name(picture.instance);
+        let calibration = model.metadata.calibration.as_ref();
+        let confidence = calibration.and_then(|calibration| Confidence::of(&estimate, &instance, calibration));
         let world_from_camera = estimate.pose.to_matrix();
         Found { world_from_camera, estimate, rgb: render.rgb, unexplained, trusted, confidence, seconds }
     }
@@ -338,8 +340,8 @@ pub struct Confidence {
 }
 
 impl Confidence {
-    fn of(estimate: &Estimate, calibration: &Calibration) -> Option<Self> {
-        let covariance = estimate.covariance(calibration)?;
+    fn of(estimate: &Estimate, instance: &str, calibration: &Calibration) -> Option<Self> {
+        let covariance = estimate.covariance(instance, calibration)?;
         let (rotation_deg, translation) = deviations(&estimate.pose.to_matrix(), &covariance);
         Some(Confidence { rotation_deg, translation, covariance })
     }
