@@ -18,7 +18,7 @@ use crate::sets::{Cache, Set};
 /// Flags of `sigma-data render`.
 #[derive(Args, Debug)]
 pub struct Render {
-    /// A public set that was fetched: parts107, chairs or cars, into OUT/train, OUT/test (the same objects) and OUT/heldout.
+    /// A public set that was fetched: parts107, parts1157, chairs or cars, into OUT/train, OUT/test (the same objects) and OUT/heldout.
     ///
     /// Or meshes: .obj, .stl, .ply, .gltf, .glb, .ac, .acc, .wrl, or LDraw .dat inside a library (parts/, p/,
     /// LDConfig.ldr). The instance is called NAME, or like the file.
@@ -39,6 +39,10 @@ pub struct Render {
     /// Views per object in OUT/test and OUT/heldout of a set. Default: 50.
     #[arg(long, value_name = "VIEWS", value_parser = clap::value_parser!(u32).range(1..))]
     test_views: Option<u32>,
+    /// Of a set: each training object, and others made of it, stretched, tapered and recoloured at random; so many in all. A model of
+    /// more objects is better at new ones.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    variants: u32,
     /// Where the cameras stand. Default: sphere. A set has a sphere for training and a spiral for the others.
     #[arg(long, value_enum)]
     cameras: Option<Cameras>,
@@ -123,6 +127,9 @@ impl Render {
         if self.test_views.is_some() {
             return Err("--test-views: only a set has test views".into());
         }
+        if self.variants > 1 {
+            return Err("--variants: only of a set".into());
+        }
         let folder = |name: &String| Folder {
             dir: self.out.join(name),
             cameras: self.cameras.unwrap_or(Cameras::Sphere),
@@ -172,15 +179,24 @@ impl Render {
                 let train = folder("train", Cameras::Sphere, views, self.jitter);
                 vec![train, folder("test", Cameras::Spiral, test_views, 0.0)]
             };
-            jobs.push((package.join(&object.path), folders, object));
+            // The variants have training views alone.
+            let variants = if object.held_out { 1 } else { self.variants };
+            let others = (1..variants).map(|k| {
+                let name = format!("{}~{k}", object.name);
+                let dir = self.out.join("train").join(&name);
+                Folder { dir, cameras: Cameras::Sphere, views, jitter: self.jitter }
+            });
+            let others: Vec<_> = others.collect();
+            jobs.push((package.join(&object.path), folders, others, object));
         }
         let sheet_file = self.out.join("sheet.png");
-        let dirs = jobs.iter().flat_map(|(_, folders, _)| folders).map(|folder| &folder.dir);
+        let all = || jobs.iter().flat_map(|(_, folders, others, _)| folders.iter().chain(others));
+        let dirs = all().map(|folder| &folder.dir);
         refuse_existing(dirs.chain([&sheet_file]).cloned(), self.force)?;
-        let pictures = jobs.iter().flat_map(|(_, folders, _)| folders).map(|folder| folder.views).sum();
+        let pictures = all().map(|folder| folder.views).sum();
         let studio = self.studio(set.radius(), pictures)?;
         let (mut counts, mut skipped, mut cells) = ([0; 2], 0, vec![]);
-        for (path, folders, object) in &jobs {
+        for (path, folders, others, object) in &jobs {
             match mesh::load(path) {
                 Ok((mut mesh, _)) => {
                     mesh.normalise(object.turn);
@@ -188,10 +204,16 @@ impl Render {
                     let picture = studio.draw(&object.name, &mesh, folders)?;
                     cells.push((picture, object.name.clone()));
                     counts[usize::from(object.held_out)] += 1;
+                    for other in others {
+                        let name = other.dir.file_name().unwrap_or_default().to_string_lossy();
+                        let mut varied = mesh.clone();
+                        varied.vary(self.seed ^ ldraw::name_hash(&name));
+                        studio.draw(&name, &varied, std::slice::from_ref(other))?;
+                    }
                 }
                 Err(error) => {
                     studio.bar.suspend(|| eprintln!("skipped: {}: {error}", object.name));
-                    studio.bar.inc(folders.iter().map(|folder| folder.views as u64).sum());
+                    studio.bar.inc(folders.iter().chain(others).map(|folder| folder.views as u64).sum());
                     skipped += 1;
                 }
             }
@@ -205,7 +227,7 @@ impl Render {
         saved.map_err(|error| format!("{}: {error}", sheet_file.display()))?;
         let [train, held_out] = counts;
         let (out, focal) = (self.out.display(), studio.intrinsics.focal[0]);
-        println!("{out}/train: {train} instances of {views} views, {focal:.3} px focal length");
+        println!("{out}/train: {} instances of {views} views, {focal:.3} px focal length", train * self.variants);
         println!("{out}/test: {train} instances of {test_views} views");
         println!("{out}/heldout: {held_out} instances of {test_views} views");
         println!("{}: a view of each object; {skipped} skipped", sheet_file.display());

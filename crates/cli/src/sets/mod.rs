@@ -17,6 +17,8 @@ use crate::common::Result;
 pub enum Set {
     /// 137 LDraw parts, in place of the paper's 107 AssemblyPose parts
     Parts107,
+    /// The same and 1050 more to train on, each of another mould: for models that take in new parts
+    Parts1157,
     /// 65 chairs and stools of the Sweet Home 3D furniture library
     Chairs,
     /// 80 cars and vans of FlightGear and of the Sweet Home 3D furniture library
@@ -97,6 +99,7 @@ impl Set {
     pub fn name(self) -> &'static str {
         match self {
             Set::Parts107 => "parts107",
+            Set::Parts1157 => "parts1157",
             Set::Chairs => "chairs",
             Set::Cars => "cars",
         }
@@ -105,7 +108,7 @@ impl Set {
     /// The paper's distance of the cameras, in diagonals of the object.
     pub fn radius(self) -> f64 {
         match self {
-            Set::Parts107 => 1.0,
+            Set::Parts107 | Set::Parts1157 => 1.0,
             Set::Chairs => 2.0,
             Set::Cars => 1.3,
         }
@@ -113,12 +116,15 @@ impl Set {
 
     /// The objects, those to train on first.
     pub fn objects(self) -> Result<Vec<Object>> {
-        let table = match self {
-            Set::Parts107 => include_str!("../../../../assets/splits/parts107.tsv"),
-            Set::Chairs => include_str!("../../../../assets/splits/chairs.tsv"),
-            Set::Cars => include_str!("../../../../assets/splits/cars.tsv"),
+        let parts107 = ("parts107", include_str!("../../../../assets/splits/parts107.tsv"));
+        let tables = match self {
+            Set::Parts107 => vec![parts107],
+            Set::Parts1157 => vec![parts107, ("parts1050", include_str!("../../../../assets/splits/parts1050.tsv"))],
+            Set::Chairs => vec![("chairs", include_str!("../../../../assets/splits/chairs.tsv"))],
+            Set::Cars => vec![("cars", include_str!("../../../../assets/splits/cars.tsv"))],
         };
-        parse(table).map_err(|error| format!("{}.tsv: {error}", self.name()).into())
+        let parse = |(name, table)| parse(table).map_err(|error| format!("{name}.tsv: {error}"));
+        Ok(tables.into_iter().map(parse).collect::<std::result::Result<Vec<_>, _>>()?.concat())
     }
 
     /// The packages that its objects come from.
@@ -134,7 +140,11 @@ impl Package {
     /// The objects of all sets that come from this package.
     fn objects(&self) -> Result<Vec<Object>> {
         let sets = Set::value_variants().iter().map(|set| set.objects()).collect::<Result<Vec<_>>>()?;
-        Ok(sets.into_iter().flatten().filter(|object| object.package == self).collect())
+        let mut objects: Vec<_> = sets.into_iter().flatten().filter(|object| object.package == self).collect();
+        // One set is part of another.
+        objects.sort_by(|one, other| one.path.cmp(&other.path));
+        objects.dedup_by(|one, other| one.path == other.path);
+        Ok(objects)
     }
 }
 
@@ -187,7 +197,9 @@ mod tests {
 
     #[test]
     fn the_splits_are_as_documented() {
-        for (set, train, held_out) in [(Set::Parts107, 107, 30), (Set::Chairs, 52, 13), (Set::Cars, 60, 20)] {
+        for (set, train, held_out) in
+            [(Set::Parts107, 107, 30), (Set::Parts1157, 1157, 30), (Set::Chairs, 52, 13), (Set::Cars, 60, 20)]
+        {
             let objects = set.objects().unwrap();
             let count = |held: bool| objects.iter().filter(|object| object.held_out == held).count();
             assert_eq!((count(false), count(true)), (train, held_out), "{set:?}");
@@ -211,7 +223,7 @@ mod tests {
         for set in Set::value_variants() {
             assert!(!set.packages().unwrap().is_empty());
         }
-        for name in ["parts107", "chairs", "cars"] {
+        for name in ["parts107", "parts1050", "chairs", "cars"] {
             let path = format!("{}/../../assets/splits/{name}.tsv", env!("CARGO_MANIFEST_DIR"));
             let table = std::fs::read_to_string(path).unwrap();
             let rows: Vec<Vec<_>> = table.lines().map(|line| line.split('\t').collect()).collect();
