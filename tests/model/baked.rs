@@ -96,6 +96,7 @@ fn it_has_nothing_to_train() {
         refused(Trainer::new(&Engine::cpu(), baked.clone(), train, 1, RAYS).err().unwrap());
     }
     refused(baked.with_new_instances(vec!["new".into()]).unwrap_err());
+    refused(baked.codes().unwrap_err());
     refused(baked.bake(0).unwrap_err());
     assert!(whole.bake(INSTANCES).unwrap_err().to_string().contains("the model has 4"));
 }

@@ -5,8 +5,10 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
+use glam::DVec3;
 use serde_json::Value;
-use sigma_srn::Model;
+use sigma_srn::camera::look_at_origin;
+use sigma_srn::{Engine, Intrinsics, Model, Renderer};
 
 const TRAIN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/dataset/train");
 const TEST: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/dataset/test");
@@ -268,17 +270,20 @@ fn a_resumed_run_must_find_what_it_began_with() {
 }
 
 #[test]
-fn adapt_fits_codes_alone() {
+fn adapt_fits_codes_then_networks() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let (run, new) = (at("run"), at("new.safetensors"));
     succeed(&format!("fit --data {TRAIN} --out {} {TINY} --steps 100 --lr 2e-3 --executor cpu", run.display()));
     let old = run.join("model.safetensors");
-    let adapt = format!("adapt --model {} --data {TEST}/seat --executor cpu --steps 40 --out", old.display());
-    let result: Value = serde_json::from_str(&succeed(&format!("{adapt} {} --json", new.display()))).unwrap();
-    let seat = &result["instances"][0];
-    assert_eq!(seat["instance"], "seat");
-    assert!(seat["fitted_psnr"].as_f64().unwrap() > 5.0 && seat["unseen_psnr"].as_f64().unwrap() > 5.0, "{seat}");
+    let adapt = format!("adapt --model {} --data {TEST}/seat --executor cpu --steps 40 --network-steps 0 --out", old.display());
+    let fitted = |args: &str| -> [f64; 2] {
+        let result: Value = serde_json::from_str(&succeed(&format!("{args} --json"))).unwrap();
+        assert_eq!(result["instances"][0]["instance"], "seat");
+        ["fitted_psnr", "unseen_psnr"].map(|psnr| result["instances"][0][psnr].as_f64().unwrap())
+    };
+    let [by_code, unseen] = fitted(&format!("{adapt} {}", new.display()));
+    assert!(by_code > 5.0 && unseen > 5.0, "{by_code} {unseen}");
 
     let [old, adapted] = [&old, &new].map(|path| Model::load(path).unwrap());
     assert_eq!((adapted.metadata.instance_names.as_slice(), adapted.metadata.side), (&["seat".to_string()][..], Some(16)));
@@ -287,6 +292,22 @@ fn adapt_fits_codes_alone() {
         assert_eq!(before.values == after.values, number != codes, "{:?}", before.tensors);
     }
     assert_ne!(old.with_new_instances(vec!["seat".into()]).unwrap().parameters[codes], adapted.parameters[codes]);
+
+    // With the networks, nearer to its views; they are held to the known objects.
+    let with_networks = at("networks.safetensors");
+    let [by_networks, _] = fitted(&format!("{adapt} {}", with_networks.display()).replace("steps 0", "steps 600"));
+    assert!(by_networks > by_code + 1.0, "{by_networks} {by_code}");
+    let learnt = Model::load(&with_networks).unwrap();
+    assert_eq!((learnt.layout.instances, learnt.metadata.instance_names.as_slice()), (1, &["seat".to_string()][..]));
+    let learnt = learnt.with_codes(old.metadata.instance_names.clone(), old.codes().unwrap().to_vec()).unwrap();
+    let engine = Engine::cpu();
+    let camera =
+        (look_at_origin(DVec3::new(1.0, -0.7, 0.4)), Intrinsics { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0, pixel_center: 0.0 });
+    let shown = |model: &Model| Renderer::new(&engine, model, 1, 16, 16).unwrap().render(&[0], &[camera], 0).unwrap().rgb;
+    let (before, after) = (shown(&old), shown(&learnt));
+    let squares: f32 = before.iter().zip(&after).map(|(a, b)| (a - b).powi(2)).sum();
+    let forgot = (squares / before.len() as f32).sqrt();
+    assert!(forgot < 0.05, "{forgot}");
 
     fail(&format!("{adapt} {}", new.display()), &["new.safetensors", "exists already"]);
     let other = at("other").display().to_string();

@@ -509,20 +509,35 @@ impl Model {
         self.metadata.instance_names.get(number as usize).cloned().unwrap_or_else(|| number.to_string())
     }
 
-    /// The same networks with `names.len()` fresh latent codes, each the mean of the old ones (two-shot fit, spec 4).
-    pub fn with_new_instances(&self, names: Vec<String>) -> Result<Self, Error> {
+    /// The latent codes, `[instances, latent]`.
+    pub fn codes(&self) -> Result<&[f32], Error> {
+        Ok(&self.parameters[self.hypernetwork()?.codes].values)
+    }
+
+    /// The same networks with these instances alone, whose latent codes are `codes`, `[names.len(), latent]`.
+    pub fn with_codes(&self, names: Vec<String>, codes: Vec<f32>) -> Result<Self, Error> {
         let hypernetwork = self.hypernetwork()?;
-        let latent = hypernetwork.latent as usize;
+        let (latent, of_codes) = (hypernetwork.latent as usize, hypernetwork.codes);
+        if codes.len() != names.len() * latent {
+            let what = format!("{} values, where {} codes have {latent} each", codes.len(), names.len());
+            return Err(Error::Input { input: "codes".into(), what });
+        }
         let mut model = self.clone();
-        let codes = &mut model.parameters[hypernetwork.codes];
-        let old = codes.values.chunks_exact(latent);
-        let count = old.len() as f32;
-        let mean: Vec<f32> = (0..latent).map(|k| old.clone().map(|code| code[k]).sum::<f32>() / count).collect();
-        codes.values = mean.repeat(names.len());
-        codes.tensors[0].1 = vec![names.len(), latent];
+        model.parameters[of_codes].values = codes;
+        model.parameters[of_codes].tensors[0].1 = vec![names.len(), latent];
         model.layout.instances = names.len() as u32;
         model.metadata.instance_names = names;
         Ok(model)
+    }
+
+    /// The same networks with `names.len()` fresh latent codes, each the mean of the old ones (two-shot fit, spec 4).
+    pub fn with_new_instances(&self, names: Vec<String>) -> Result<Self, Error> {
+        let latent = self.hypernetwork()?.latent as usize;
+        let old = self.codes()?.chunks_exact(latent);
+        let count = old.len() as f32;
+        let mean: Vec<f32> = (0..latent).map(|k| old.clone().map(|code| code[k]).sum::<f32>() / count).collect();
+        let codes = mean.repeat(names.len());
+        self.with_codes(names, codes)
     }
 }
 

@@ -36,8 +36,7 @@ pub fn estimate_unseen(
     seed: u64,
     mut observe: impl FnMut(usize, usize) -> Result<(), Error>,
 ) -> Result<Unseen, Error> {
-    let latent = model.hypernetwork()?.latent as usize;
-    let codes = model.hypernetwork()?.codes;
+    let (latent, codes) = (model.hypernetwork()?.latent as usize, model.codes()?);
     observe(0, ROUNDS + 1)?;
     let known: Vec<Query> = (0..model.layout.instances).map(|instance| Query { instance, ..query.clone() }).collect();
     let phase = |steps, stride, keep| Phase { steps, stride, keep };
@@ -50,9 +49,9 @@ pub fn estimate_unseen(
     order.truncate(CANDIDATES);
 
     let names = order.iter().map(|&instance| model.instance_name(instance as u32)).collect();
-    let mut fitted = model.with_new_instances(names)?;
-    let code = |instance: &usize| &model.parameters[codes].values[instance * latent..][..latent];
-    fitted.parameters[codes].values = order.iter().flat_map(code).copied().collect();
+    let code = |of: &[f32], instance: usize| of[instance * latent..][..latent].to_vec();
+    let nearest = order.iter().flat_map(|&instance| code(codes, instance)).collect();
+    let mut fitted = model.with_codes(names, nearest)?;
     let mut poses: Vec<DMat4> = order.iter().map(|&instance| looks[instance].pose.to_matrix()).collect();
     let mut estimates = Vec::new();
     for round in 1..=ROUNDS {
@@ -68,8 +67,7 @@ pub fn estimate_unseen(
     let mut by_loss: Vec<usize> = (0..estimates.len()).collect();
     by_loss.sort_by(|&a, &b| estimates[a].loss.total_cmp(&estimates[b].loss));
     let best = by_loss[0];
-    let mut model = fitted.with_new_instances(vec!["unseen".into()])?;
-    model.parameters[codes].values = fitted.parameters[codes].values[best * latent..][..latent].to_vec();
+    let model = fitted.with_codes(vec!["unseen".into()], code(fitted.codes()?, best))?;
     // Each went on from another known object: where they end in different poses, the object may be one thing here or another there.
     let ranked = |k: usize| Ranked { start: looks[order[k]].ranking[0].start, ..estimates[k].ranking[0] };
     let ranking = by_loss.into_iter().map(ranked).collect();

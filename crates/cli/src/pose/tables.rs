@@ -16,7 +16,7 @@ use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::views::{self, Views, spread};
 use crate::common::{Result, load_model, load_set, progress, refuse_existing};
-use crate::train::adapt::{FitCodes, fit_codes};
+use crate::train::adapt::Fit;
 
 /// Files that are written.
 const FILES: [&str; 5] = ["tables.md", "views.csv", "convergence.csv", "convergence.png", "worst.png"];
@@ -110,9 +110,9 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
         worst.iter().map(|(report, picture, found)| (report.clone(), picture, found.clone())).collect();
     write_png(&paths[4], &pictures_sheet(&pictures, side, WORST))?;
     let unknown = heldout.map(|heldout| two_shot(&bench.engine, args, &model, heldout, side)).transpose()?;
-    if let Some((fitted, unseen)) = &unknown {
+    if let Some(TwoShot { ours, unseen, .. }) = &unknown {
         for starts in STARTS {
-            bench.search(fitted, side, unseen, setting(2, Preset::Default, &starts))?;
+            bench.search(ours, side, unseen, setting(2, Preset::Default, &starts))?;
         }
         let one_shot = Setting { preset: None, ..setting(2, Preset::Default, &Starts::Around84) };
         bench.search(&model, side, &few(unseen), one_shot)?;
@@ -121,9 +121,9 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     for starts in PAPER_STARTS {
         bench.search(&model, side, &few(&asked), setting(1, Preset::Paper, &starts))?;
     }
-    if let Some((fitted, unseen)) = &unknown {
+    if let Some(TwoShot { paper, unseen, .. }) = &unknown {
         for starts in PAPER_STARTS {
-            bench.search(fitted, side, &few(unseen), setting(2, Preset::Paper, &starts))?;
+            bench.search(paper, side, &few(unseen), setting(2, Preset::Paper, &starts))?;
         }
     }
     for loss in LOSSES.into_iter().filter(|loss| *loss != mae) {
@@ -134,16 +134,24 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     Ok(true)
 }
 
-/// The model with the objects of a set fitted to two views each, and the other views.
-fn two_shot(engine: &Engine, args: &Evaluate, model: &Model, mut set: Dataset, side: u32) -> Result<(Model, Vec<Views>)> {
+/// A model with the objects of a set fitted to two views each, and the other views.
+struct TwoShot {
+    ours: Model,
+    /// Only the codes were fitted.
+    paper: Model,
+    unseen: Vec<Views>,
+}
+
+fn two_shot(engine: &Engine, args: &Evaluate, model: &Model, mut set: Dataset, side: u32) -> Result<TwoShot> {
     set.instances = spread(set.instances, args.instances as usize);
-    let model = model.with_new_instances(set.instances.iter().map(|instance| instance.name.clone()).collect())?;
+    let names: Vec<String> = set.instances.iter().map(|instance| instance.name.clone()).collect();
     // Two views a quarter of the way from either end.
     let fitted = |count: usize| -> [usize; SHOTS] { [count / 4, count - 1 - count / 4] };
     let instances = || (0..).zip(&set.instances);
     let of = |(i, instance): (u32, &'_ Instance)| fitted(instance.views.len()).map(|k| (i, k));
     let shown: Vec<_> = instances().flat_map(of).map(|(i, k)| (i, &set.instances[i as usize].views[k])).collect();
-    let model = fit_codes(engine, model, &shown, side, &FitCodes::default())?;
+    let fitted_by = |fit: Fit| fit.run(engine, model, names.clone(), &shown, side);
+    let (ours, paper) = (fitted_by(Fit::default())?, fitted_by(Fit::default().of_codes())?);
     let unseen = instances().map(|(i, instance)| {
         let others = instance.views.iter().enumerate().filter(|(k, _)| !fitted(instance.views.len()).contains(k));
         let others: Vec<_> = others.map(|(_, view)| view.clone()).collect();
@@ -151,7 +159,7 @@ fn two_shot(engine: &Engine, args: &Evaluate, model: &Model, mut set: Dataset, s
         let (pictures, truths) = views.unzip();
         Views { name: instance.name.clone(), dir: args.data.join(&instance.name), pictures, truths }
     });
-    Ok((model, unseen.collect()))
+    Ok(TwoShot { ours, paper, unseen: unseen.collect() })
 }
 
 /// A line of a table.

@@ -1,10 +1,14 @@
-//! `sigma-train adapt`: the two-shot fit (spec 4). The networks are frozen; new instances get latent codes.
+//! `sigma-train adapt`: the two-shot fit. New instances get latent codes, while the networks are frozen (spec 4); then the networks learn
+//! what no code can say.
 
 use std::path::PathBuf;
 
 use clap::Args;
+use glam::DMat4;
+use rand::RngExt;
 use serde::Serialize;
 use sigma_srn::{Engine, Model, Train, Trainer, stream};
+use srn_data::camera::uniform_sphere;
 use srn_data::{Instance, LoadedView};
 
 use super::settings::{positive, up_to};
@@ -14,10 +18,17 @@ use crate::common::{self, EngineArgs, Result};
 /// Unseen views of an instance that are looked at in the end, at most.
 const UNSEEN: usize = 8;
 
-/// Defaults of [`FitCodes`].
-const STEPS: u64 = 1000;
-const LEARNING_RATE: f64 = 1e-3;
-const RAYS: u32 = 1024;
+/// Defaults of [`Fit`].
+const STEPS: u64 = 500;
+const LEARNING_RATE: f64 = 3e-3;
+const NETWORK_STEPS: u64 = 400;
+const NETWORK_LEARNING_RATE: f64 = 1e-3;
+const RAYS: u32 = 256;
+/// Views of known objects that the networks are held to, and how many of them in a step.
+const KNOWN: usize = 64;
+const KNOWN_IN_STEP: usize = 8;
+/// Part of the networks' rays that is drawn where a picture is not of one colour.
+const DETAIL: f64 = 0.5;
 
 /// Flags of `sigma-train adapt`.
 #[derive(Args, Debug)]
@@ -28,7 +39,7 @@ pub struct AdaptArgs {
     /// New instances: a folder of SRN instance folders, or one of those.
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
-    /// The model to write: the same networks, the new instances alone.
+    /// The model to write: the new instances alone.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Fit to the first views of each instance, this many.
@@ -38,7 +49,7 @@ pub struct AdaptArgs {
     #[arg(long, value_name = "NAME", conflicts_with = "views")]
     view: Vec<String>,
     #[command(flatten)]
-    fit: FitCodes,
+    fit: Fit,
     /// Side of the images in pixels [the model's].
     #[arg(long, value_name = "PIXELS", value_parser = up_to(4096))]
     side: Option<u32>,
@@ -49,46 +60,108 @@ pub struct AdaptArgs {
     json: bool,
 }
 
-/// How codes are fitted.
+/// How new instances are fitted.
 #[derive(Args, Clone, Debug)]
-pub struct FitCodes {
-    /// Number of steps.
+pub struct Fit {
+    /// Steps for the codes alone.
     #[arg(long, value_name = "N", default_value_t = STEPS, value_parser = clap::value_parser!(u64).range(1..))]
     steps: u64,
-    /// Learning rate of Adam.
+    /// Learning rate of Adam for them.
     #[arg(long, value_name = "RATE", default_value_t = LEARNING_RATE, value_parser = positive)]
     lr: f64,
+    /// Steps for codes and networks after that, with views of known objects, as the model shows them, that the networks are held to; the last
+    /// third at a tenth of the rate. 0 leaves the networks as they are, as in the paper.
+    #[arg(long, value_name = "N", default_value_t = NETWORK_STEPS)]
+    network_steps: u64,
+    /// Learning rate of Adam for these.
+    #[arg(long, value_name = "RATE", default_value_t = NETWORK_LEARNING_RATE, value_parser = positive)]
+    network_lr: f64,
     /// Random rays per image and step, at most a whole image.
     #[arg(long, value_name = "N", default_value_t = RAYS, value_parser = up_to(u32::MAX))]
     rays: u32,
-    /// Decides the random rays.
+    /// Decides the random rays, and the views of known objects.
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
 }
 
-impl Default for FitCodes {
+impl Default for Fit {
     fn default() -> Self {
-        FitCodes { steps: STEPS, lr: LEARNING_RATE, rays: RAYS, seed: 0 }
+        let (steps, lr, network_steps, network_lr) = (STEPS, LEARNING_RATE, NETWORK_STEPS, NETWORK_LEARNING_RATE);
+        Fit { steps, lr, network_steps, network_lr, rays: RAYS, seed: 0 }
     }
 }
 
-/// Fits the codes to views, everything else frozen.
-pub fn fit_codes(engine: &Engine, model: Model, views: &[Shown], side: u32, how: &FitCodes) -> Result<Model> {
-    let rays = how.rays.min(side * side);
-    let mut trainer = Trainer::new(engine, model, Train::Codes, views.len() as u32, rays)?;
-    let bar = common::progress(how.steps, "fitting");
-    for step in 1..=how.steps {
-        trainer.step(&training_batch(views, side, rays, 0.0, &mut stream(how.seed, step)), how.lr)?;
-        bar.inc(1);
-        if step.is_multiple_of(20) || step == how.steps {
-            bar.set_message(format!("PSNR {:.2} dB", trainer.losses()?.psnr()));
+impl Fit {
+    /// As in the paper: the networks stay.
+    pub const fn of_codes(self) -> Self {
+        Fit { network_steps: 0, ..self }
+    }
+
+    /// The trained model with these instances instead of its own, fitted to views of them.
+    pub fn run(&self, engine: &Engine, trained: &Model, names: Vec<String>, views: &[Shown], side: u32) -> Result<Model> {
+        let bar = common::progress(self.steps + self.network_steps, "fitting");
+        let rays = self.rays.min(side * side);
+        let model = trained.with_new_instances(names.clone())?;
+        let mut trainer = Trainer::new(engine, model, Train::Codes, views.len() as u32, rays)?;
+        let take = |trainer: &mut Trainer, step: u64, views: &[Shown], detail, lr| -> Result<()> {
+            trainer.step(&training_batch(views, side, rays, detail, &mut stream(self.seed, step)), lr)?;
+            bar.inc(1);
+            if step.is_multiple_of(20) || step == self.steps + self.network_steps {
+                bar.set_message(format!("PSNR {:.2} dB", trainer.losses()?.psnr()));
+            }
+            Ok(())
+        };
+        for step in 1..=self.steps {
+            take(&mut trainer, step, views, 0.0, self.lr)?;
         }
+        let fitted = trainer.model()?.clone();
+        drop(trainer);
+        if self.network_steps == 0 {
+            bar.finish_and_clear();
+            return Ok(fitted);
+        }
+        // Instances: the new ones, then the known ones.
+        let known = self.known(engine, trained, views, side)?;
+        let all = (0..trained.layout.instances).map(|instance| trained.instance_name(instance));
+        let all = names.iter().cloned().chain(all).collect();
+        let joined = trained.with_codes(all, [fitted.codes()?, trained.codes()?].concat())?;
+        let shown: Vec<Shown> = known.iter().map(|(instance, view)| (names.len() as u32 + instance, view)).collect();
+        let batch = views.len() + KNOWN_IN_STEP;
+        let mut trainer = Trainer::new(engine, joined, Train::Everything, batch as u32, rays)?;
+        for step in 1..=self.network_steps {
+            let lr = if 3 * step > 2 * self.network_steps { 0.1 * self.network_lr } else { self.network_lr };
+            let some = shown.iter().cycle().skip(step as usize * KNOWN_IN_STEP % KNOWN).take(KNOWN_IN_STEP);
+            let views: Vec<Shown> = views.iter().chain(some).copied().collect();
+            take(&mut trainer, self.steps + step, &views, DETAIL, lr)?;
+        }
+        bar.finish_and_clear();
+        let joined = trainer.model()?;
+        let codes = joined.codes()?[..fitted.codes()?.len()].to_vec();
+        Ok(joined.with_codes(names, codes)?)
     }
-    bar.finish_and_clear();
-    Ok(trainer.model()?.clone())
+
+    /// Views of the trained model's own instances, drawn at random, from as far away as it was trained, through the first view's lens.
+    fn known(&self, engine: &Engine, trained: &Model, views: &[Shown], side: u32) -> Result<Vec<(u32, LoadedView)>> {
+        let intrinsics = views[0].1.intrinsics;
+        let distance = |&(_, view): &Shown| common::camera(view).0.w_axis.truncate().length();
+        let radius =
+            trained.metadata.orbit_radius.unwrap_or_else(|| views.iter().map(distance).sum::<f64>() / views.len() as f64);
+        let mut random = stream(self.seed, 0);
+        let view = |camera: DMat4| {
+            let world_from_camera = camera.transpose().to_cols_array();
+            let view = LoadedView { name: String::new(), rgb: vec![], world_from_camera, intrinsics };
+            (random.random_range(0..trained.layout.instances), view)
+        };
+        let mut known: Vec<_> = uniform_sphere(KNOWN, radius, self.seed).into_iter().map(view).collect();
+        let shown: Vec<Shown> = known.iter().map(|(instance, view)| (*instance, view)).collect();
+        let rendering = render(engine, trained, &shown, side)?;
+        let pictures = rendering.rgb.chunks_exact(3 * (side * side) as usize);
+        known.iter_mut().zip(pictures).for_each(|((_, view), rgb)| view.rgb = rgb.to_vec());
+        Ok(known)
+    }
 }
 
-/// Fits codes to a few views of each instance, and writes the model.
+/// Fits new instances to a few views of each, and writes the model.
 pub fn adapt(args: &AdaptArgs) -> Result<bool> {
     let out = args.out.display();
     if args.out.exists() {
@@ -101,13 +174,13 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
     let model = common::load_model(&args.model)?;
     let side = args.side.or(model.metadata.side).ok_or("the model file names no image side; give --side")?;
     let set = common::load_set(&args.data, side)?;
-    let model = model.with_new_instances(set.instances.iter().map(|instance| instance.name.clone()).collect());
-    let model = model.map_err(|error| common::about_model(&args.model, error))?;
+    model.hypernetwork().map_err(|error| common::about_model(&args.model, error))?;
     let split = set.instances.iter().map(|instance| split(args, instance)).collect::<Result<Vec<_>>>()?;
     let fitted: Vec<Shown> = (0..).zip(&split).flat_map(|(k, (fitted, _))| fitted.iter().map(move |&view| (k, view))).collect();
 
     let engine = args.engine.open()?;
-    let model = fit_codes(&engine, model, &fitted, side, &args.fit)?;
+    let names = set.instances.iter().map(|instance| instance.name.clone()).collect();
+    let model = args.fit.run(&engine, &model, names, &fitted, side)?;
     let mut results = vec![];
     for (instance, (fitted, unseen)) in (0..).zip(&split) {
         let views: Vec<Shown> = fitted.iter().chain(unseen).map(|&view| (instance, view)).collect();
