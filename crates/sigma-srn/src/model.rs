@@ -514,7 +514,8 @@ impl Model {
         Ok(&self.parameters[self.hypernetwork()?.codes].values)
     }
 
-    /// The same networks with these instances alone, whose latent codes are `codes`, `[names.len(), latent]`.
+    /// The same networks with these instances alone, whose latent codes are `codes`, `[names.len(), latent]`. Without the calibration, which tells
+    /// of errors at the old ones.
     pub fn with_codes(&self, names: Vec<String>, codes: Vec<f32>) -> Result<Self, Error> {
         let hypernetwork = self.hypernetwork()?;
         let (latent, of_codes) = (hypernetwork.latent as usize, hypernetwork.codes);
@@ -526,7 +527,7 @@ impl Model {
         model.parameters[of_codes].values = codes;
         model.parameters[of_codes].tensors[0].1 = vec![names.len(), latent];
         model.layout.instances = names.len() as u32;
-        model.metadata.instance_names = names;
+        (model.metadata.instance_names, model.metadata.calibration) = (names, None);
         Ok(model)
     }
 

@@ -219,21 +219,21 @@ impl SearchArgs {
     ) -> Result<(Found, Model)> {
         let On { engine, model, side } = on;
         let began = Instant::now();
-        let Unseen { estimate, model, .. } = estimate_unseen(engine, model, &query(picture, side, starts), self.seed, observe)?;
+        let query = query(picture, side, starts);
+        // It has no calibration: the deviations that `calibrate` has found are those of known objects.
+        let Unseen { estimate, model: fitted, .. } = estimate_unseen(engine, model, &query, self.seed, observe)?;
         let seconds = began.elapsed().as_secs_f64();
         let view = (0, estimate.pose.to_matrix(), picture.intrinsics);
-        let render = render(On { model: &model, ..on }, &[view])?.swap_remove(0);
-        let found = self.found(&model, picture, estimate, render, seconds);
-        let trusted = self.trusts_unseen(&model, &found);
-        // The deviations that `calibrate` has found are those of known objects.
-        Ok((Found { trusted, confidence: None, ..found }, model))
+        let render = render(On { model: &fitted, ..on }, &[view])?.swap_remove(0);
+        let found = self.found(&fitted, picture, estimate, render, seconds);
+        Ok((Found { trusted: self.trusts_unseen(model, &found), ..found }, fitted))
     }
 
     fn found(&self, model: &Model, picture: &Picture, estimate: Estimate, render: Rendering, seconds: f64) -> Found {
         let unexplained = unexplained(picture, &render.rgb);
         let trusted = self.trusts(model, picture.instance, &estimate, unexplained);
-        let instance = model.instance_name(picture.instance);
         let calibration = model.metadata.calibration.as_ref();
+        let instance = model.instance_name(picture.instance);
         let confidence = calibration.and_then(|calibration| Confidence::of(&estimate, &instance, calibration));
         let world_from_camera = estimate.pose.to_matrix();
         Found { world_from_camera, estimate, rgb: render.rgb, unexplained, trusted, confidence, seconds }
