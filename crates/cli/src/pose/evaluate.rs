@@ -48,7 +48,7 @@ pub struct Evaluate {
     /// worst searches.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["starts", "json", "out"])]
     pub(super) tables: Option<PathBuf>,
-    /// For --tables: instances that the model was not trained on; their codes are fitted to two views each (the paper's Table 2).
+    /// For --tables: instances that the model was not trained on; they are fitted to two views each (the paper's Table 2).
     #[arg(long, value_name = "DIR", requires = "tables")]
     pub(super) heldout: Option<PathBuf>,
     /// For --tables: how many of all views the paper's preset searches for, which takes minutes a view on a CPU. Default: all.

@@ -331,7 +331,7 @@ impl Bench<'_> {
     fn tables(&self) -> String {
         let titles = [
             "Table 1: unseen views of known objects",
-            "Table 2: objects that the model was not trained on, their codes fitted to two views, or with the pose to one",
+            "Table 2: objects that the model was not trained on, fitted to two views (paper: codes alone), or with the pose to one",
             "Table 3: losses, from `neighbor4`",
         ];
         let command: Vec<String> = std::env::args().skip(1).collect();
