@@ -98,5 +98,7 @@ fn it_has_nothing_to_train() {
     refused(baked.with_new_instances(vec!["new".into()]).unwrap_err());
     refused(baked.codes().unwrap_err());
     refused(baked.bake(0).unwrap_err());
+    let error = whole.with_codes(vec!["new".into()], vec![0.0]).unwrap_err().to_string();
+    assert!(error.contains("codes") && error.contains("1 values"), "{error}");
     assert!(whole.bake(INSTANCES).unwrap_err().to_string().contains("the model has 4"));
 }
