@@ -155,6 +155,46 @@ fn an_object_is_found_without_its_name() {
     }
 }
 
+/// The second derivatives of an estimate are those at its pose, not what the way there has left of them: deviations must not depend on
+/// how many steps were taken.
+#[test]
+fn second_derivatives_are_those_of_the_place() {
+    let mut trainer = trainer(&Engine::cpu());
+    train(&mut trainer, 100);
+    let model = trainer.model().unwrap();
+    let truth = camera::fixed24(1.3)[1];
+    let rgb = picture(1, &truth);
+    let starts = vec![glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2) * truth];
+    let query = Query { instance: 1, rgb, weights: None, width: SIDE, height: SIDE, intrinsics: intrinsics(), starts };
+    for engine in engines() {
+        let phases = vec![Phase { steps: 15, stride: 1, keep: 1 }];
+        let options = Options { phases, min_starts: 0, seed: 0, ..Options::default() };
+        let mut learnt = Vec::new();
+        let observe = |progress: sigma_srn::Progress| {
+            learnt = progress.descent.curvatures()?;
+            Ok(())
+        };
+        let found = estimate(&engine, model, std::slice::from_ref(&query), &options, observe).unwrap().swap_remove(0);
+
+        let shape = Shape { hypotheses: 1, width: SIDE, height: SIDE, instances: 1 };
+        let mut descent = Descent::new(&engine, model, shape, options.method).unwrap();
+        let mut rays = Rays::default();
+        rays.push(&truth, &intrinsics(), pixel_grid(SIDE, SIDE, 1), &mut stream(0, 0));
+        descent.set_targets(&[1], &[0], &rays, &query.rgb, None).unwrap();
+        descent.set_poses(&[found.pose]).unwrap();
+        descent.evaluate().unwrap();
+        let there = descent.curvatures().unwrap()[0];
+
+        let apart = |other: &[[f64; 6]; 6]| {
+            let pairs = || there.iter().flatten().zip(other.iter().flatten());
+            pairs().map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt() / pairs().map(|(a, _)| a * a).sum::<f64>().sqrt()
+        };
+        let (of_estimate, of_way) = (apart(&found.curvature.unwrap()), apart(&learnt[0]));
+        println!("{engine}: {of_estimate:.1e}, what the search has learnt on its way {of_way:.1e} apart");
+        assert!(of_estimate < 1e-3 && of_way > 0.05, "{engine}: {of_estimate} {of_way}");
+    }
+}
+
 /// Something black stands before a corner of the picture: where it does not count, the search ends as if it were not there, to the
 /// last digit, and so do its losses.
 #[test]

@@ -155,7 +155,8 @@ pub struct Estimate {
     pub pose: Pose6,
     /// Its loss.
     pub loss: f64,
-    /// Second derivatives of the loss there, over a turn about the object and a shift, in the camera's axes; with BFGS only.
+    /// Second derivatives of the loss there, those of least squares, over a turn about the object and a shift, in the camera's axes; with
+    /// BFGS only.
     pub curvature: Option<[[f64; 6]; 6]>,
     /// All starts, the winner first: more phases before fewer, then by loss.
     pub ranking: Vec<Ranked>,
@@ -239,9 +240,17 @@ pub fn estimate(
             descent.evaluate()?;
         }
         observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
-        let curvatures = descent.curvatures()?;
-        running.iter_mut().zip(curvatures).for_each(|(hypothesis, curvature)| hypothesis.curvature = Some(curvature));
-        for (hypothesis, standing) in running.iter_mut().zip(descent.standing()?) {
+        let standing = descent.standing()?;
+        if number + 1 == options.phases.len() && matches!(options.method, Method::Bfgs { .. }) {
+            // What BFGS has learnt of them by now depends on how many steps it took, and on their way.
+            let poses: Vec<Pose6> = standing.iter().map(|(_, pose)| *pose).collect();
+            descent.set_poses(&poses)?;
+            descent.evaluate()?;
+            for (hypothesis, curvature) in running.iter_mut().zip(descent.curvatures()?) {
+                hypothesis.curvature = Some(curvature);
+            }
+        }
+        for (hypothesis, standing) in running.iter_mut().zip(standing) {
             (hypothesis.loss, hypothesis.pose) = standing;
             // A NaN must not win; something near the largest f32 is what a descent holds that never had another.
             if hypothesis.loss.is_nan() || hypothesis.loss > 1e38 {
