@@ -118,12 +118,16 @@ pub struct Curve<'a> {
     pub colour: Colour,
 }
 
-/// A line plot with axes, a few labelled ticks and a legend; `log_y` takes a logarithmic vertical axis.
-pub fn plot_curve(title: &str, curves: &[Curve], [width, height]: [u32; 2], log_y: bool) -> RgbImage {
-    let scale_y = |y: f64| if log_y { y.log10() } else { y };
-    let usable = |&&(x, y): &&(f64, f64)| x.is_finite() && scale_y(y).is_finite();
-    let placed =
-        |curve: &Curve| -> Vec<DVec2> { curve.points.iter().filter(usable).map(|&(x, y)| DVec2::new(x, scale_y(y))).collect() };
+/// Labels on an axis, at most.
+const MOST_TICKS: usize = 7;
+
+/// A line plot with axes, a few labelled ticks and a legend; `log` tells which of the axes, x and y, are logarithmic.
+pub fn plot_curve(title: &str, curves: &[Curve], [width, height]: [u32; 2], log: [bool; 2]) -> RgbImage {
+    let scale = |value: f64, log: bool| if log { value.log10() } else { value };
+    let place = |x: f64, y: f64| DVec2::new(scale(x, log[0]), scale(y, log[1]));
+    let placed = |curve: &Curve| -> Vec<DVec2> {
+        curve.points.iter().map(|&(x, y)| place(x, y)).filter(|point| point.is_finite()).collect()
+    };
     let lines: Vec<_> = curves.iter().map(placed).collect();
     let all = || lines.iter().flatten().copied();
     let [mut low, mut high] = [all().fold(DVec2::MAX, DVec2::min), all().fold(DVec2::MIN, DVec2::max)];
@@ -140,15 +144,18 @@ pub fn plot_curve(title: &str, curves: &[Curve], [width, height]: [u32; 2], log_
         DVec2::new(left + t.x * (right - left), bottom - t.y * (bottom - top))
     };
     text(&mut image, 8, 8, title, BLACK);
-    for i in 0..=4 {
-        let value = low + (high - low) * f64::from(i) / 4.0;
-        let at = to_pixel(value);
-        line(&mut image, DVec2::new(left, at.y), DVec2::new(right, at.y), GREY);
-        let y_label = tick(if log_y { 10f64.powf(value.y) } else { value.y });
-        text(&mut image, left as i32 - 4 - (y_label.len() as u32 * GLYPH) as i32, at.y as i32 - 4, &y_label, BLACK);
-        let x_label = tick(value.x);
-        let x = (at.x as i32 - (x_label.len() * 4) as i32).min(width as i32 - (x_label.len() * 8) as i32);
-        text(&mut image, x, bottom as i32 + 8, &x_label, BLACK);
+    for value in ticks(low.y, high.y, log[1]) {
+        let at = to_pixel(DVec2::new(low.x, scale(value, log[1])));
+        line(&mut image, at, DVec2::new(right, at.y), GREY);
+        let label = tick(value);
+        text(&mut image, left as i32 - 4 - (label.len() as u32 * GLYPH) as i32, at.y as i32 - 4, &label, BLACK);
+    }
+    for value in ticks(low.x, high.x, log[0]) {
+        let at = to_pixel(DVec2::new(scale(value, log[0]), low.y));
+        line(&mut image, at, at + DVec2::new(0.0, 4.0), BLACK);
+        let label = tick(value);
+        let x = (at.x as i32 - (label.len() * 4) as i32).min(width as i32 - (label.len() * 8) as i32);
+        text(&mut image, x, bottom as i32 + 8, &label, BLACK);
     }
     line(&mut image, DVec2::new(left, top), DVec2::new(left, bottom), BLACK);
     line(&mut image, DVec2::new(left, bottom), DVec2::new(right, bottom), BLACK);
@@ -165,6 +172,29 @@ pub fn plot_curve(title: &str, curves: &[Curve], [width, height]: [u32; 2], log_
         text(&mut image, x, top as i32 + 4 + 10 * i as i32, curve.label, curve.colour);
     }
     image
+}
+
+/// Round values between two places on an axis; `log`: the places are decimal logarithms.
+fn ticks(low: f64, high: f64, log: bool) -> Vec<f64> {
+    let within = |value: &f64| (low..=high).contains(&if log { value.log10() } else { *value });
+    if log {
+        let decades = low.floor() as i32..=high.ceil() as i32;
+        for digits in [&[1.0, 2.0, 5.0][..], &[1.0]] {
+            let of_decade = |decade| digits.iter().map(move |digit| digit * 10f64.powi(decade));
+            let values: Vec<f64> = decades.clone().flat_map(of_decade).filter(within).collect();
+            if (2..=MOST_TICKS).contains(&values.len()) {
+                return values;
+            }
+        }
+        if high - low > 1.0 {
+            return ticks(low, high, false).into_iter().map(|exponent| 10f64.powf(exponent)).collect();
+        }
+        return ticks(10f64.powf(low), 10f64.powf(high), false);
+    }
+    let decade = 10f64.powf(((high - low) / MOST_TICKS as f64).log10().floor());
+    let steps = [1.0, 2.0, 5.0, 10.0].map(|digit| digit * decade);
+    let step = steps.into_iter().find(|step| (high - low) / step < MOST_TICKS as f64).unwrap_or(high - low);
+    (0..=MOST_TICKS).map(|k| ((low / step).ceil() + k as f64) * step).filter(within).collect()
 }
 
 /// A number in at most eight characters.
@@ -259,7 +289,7 @@ mod tests {
     fn a_falling_curve_falls() {
         let points: Vec<_> = (0..100).map(|i| (f64::from(i), 10f64.powf(-f64::from(i) / 25.0))).collect();
         let colour = CURVES[0];
-        let image = plot_curve("loss", &[Curve { label: "", points: &points, colour }], [400, 300], true);
+        let image = plot_curve("loss", &[Curve { label: "", points: &points, colour }], [400, 300], [false, true]);
         let row_of = |x: u32| (0..300).find(|&y| image.get_pixel(x, y).0 == colour);
         // Straight on the logarithmic axis: the middle lies half-way down.
         let [left, middle, right] = [74, 228, 382].map(|x| row_of(x).expect("the curve") as i32);
@@ -271,10 +301,25 @@ mod tests {
         for points in
             [vec![], vec![(0.0, f64::NAN)], vec![(1.0, 2.0)], vec![(0.0, 0.0), (1.0, -1.0)], vec![(0.0, 3.0), (1.0, 3.0)]]
         {
-            for log_y in [false, true] {
-                plot_curve("", &[Curve { label: "x", points: &points, colour: BLACK }], [200, 100], log_y);
+            for log in [[false; 2], [true; 2]] {
+                plot_curve("", &[Curve { label: "x", points: &points, colour: BLACK }], [200, 100], log);
             }
         }
+    }
+
+    #[test]
+    fn ticks_are_round() {
+        let nearly = |(low, high, log), expected: &[f64]| {
+            let found = ticks(low, high, log);
+            let same = found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9 * b.abs().max(1.0));
+            assert!(found.len() == expected.len() && same, "{found:?}");
+        };
+        nearly((0.0, 300.0, false), &[0.0, 50.0, 100.0, 150.0, 200.0, 250.0, 300.0]);
+        nearly((-1.3, 1.1, false), &[-1.0, -0.5, 0.0, 0.5, 1.0]);
+        nearly((0.75f64.log10(), 135f64.log10(), true), &[1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0]);
+        nearly((-4.1, 0.3, true), &[1e-4, 1e-3, 1e-2, 1e-1, 1.0]);
+        nearly((-20.0, 0.5, true), &[1e-20, 1e-15, 1e-10, 1e-5, 1.0]);
+        nearly((6f64.log10(), 8.5f64.log10(), true), &[6.0, 6.5, 7.0, 7.5, 8.0, 8.5]);
     }
 
     #[test]

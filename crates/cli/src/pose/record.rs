@@ -209,7 +209,7 @@ impl Page<'_> {
                 _ => Curve { label: "", points, colour: FAINT },
             })
             .collect();
-        sheet::plot_curve("loss at each step; starts that promise little are dropped", &curves, size, true)
+        sheet::plot_curve("loss at each step; starts that promise little are dropped", &curves, size, [false, true])
     }
 }
 

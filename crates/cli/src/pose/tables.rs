@@ -1,5 +1,6 @@
 //! `sigma-pose evaluate --tables`: the paper's tables and its figure of convergence, for any model and data.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::Instant;
 
@@ -106,6 +107,10 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     for starts in STARTS {
         worst.extend(bench.search(&model, side, &asked, setting(1, Preset::Default, &starts))?);
     }
+    // Each view once, from where it came out worst.
+    worst.sort_by(|(a, ..), (b, ..)| b.error.rotation_deg.total_cmp(&a.error.rotation_deg));
+    let mut shown = BTreeSet::new();
+    worst.retain(|(report, ..)| shown.insert((report.instance.clone(), report.view.clone())));
     let pictures: Vec<(ViewReport, &Picture, Found)> =
         worst.iter().map(|(report, picture, found)| (report.clone(), picture, found.clone())).collect();
     write_png(&paths[4], &pictures_sheet(&pictures, side, WORST))?;
@@ -375,7 +380,7 @@ impl Bench<'_> {
     fn convergence(&self) -> image::RgbImage {
         let is_drawn = |setting: &Setting| setting.table != 2 && ["charbonnier", "mae"].contains(&setting.loss());
         let outcomes: Vec<&Outcome> = self.outcomes.iter().filter(|outcome| is_drawn(&outcome.setting)).collect();
-        let plot = |title: &str, x: &dyn Fn(&Moment) -> f64| {
+        let plot = |title: &str, x: &dyn Fn(&Moment) -> f64, log_x: bool| {
             let points = |outcome: &&Outcome| -> Vec<(f64, f64)> {
                 let median = |moment: &Moment| Statistics::of(moment.errors.iter().copied()).median;
                 outcome.moments.iter().map(|moment| (x(moment), median(moment))).collect()
@@ -385,10 +390,10 @@ impl Bench<'_> {
                 outcomes.iter().map(|outcome| format!("{} {}", outcome.setting.preset(), outcome.setting.starts)).collect();
             let curve = |(k, points): (usize, _)| Curve { label: labels[k].as_str(), points, colour: CURVES[k % CURVES.len()] };
             let curves: Vec<Curve> = lines.iter().map(Vec::as_slice).enumerate().map(curve).collect();
-            sheet::plot_curve(title, &curves, [800, 400], true)
+            sheet::plot_curve(title, &curves, [800, 400], [log_x, true])
         };
-        let by_step = plot("median rotation error in degrees, against steps", &|moment| moment.step.into());
-        let by_time = plot("the same against seconds a view, their decimal logarithm", &|moment| moment.seconds.log10());
+        let by_step = plot("median rotation error in degrees, against steps", &|moment| moment.step.into(), false);
+        let by_time = plot("the same against seconds a view", &|moment| moment.seconds, true);
         sheet::grid(&[(&by_step, ""), (&by_time, "")], 1)
     }
 }

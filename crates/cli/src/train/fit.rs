@@ -323,9 +323,9 @@ impl Metrics {
         let loss = points(&|record| Some(record.loss));
         let [training, validation] = [points(&|record| Some(record.psnr)), points(&|record| record.validation_psnr)];
         let size = [800, 400];
-        let loss = sheet::plot_curve("loss", &[curve("", &loss, 0)], size, true);
+        let loss = sheet::plot_curve("loss", &[curve("", &loss, 0)], size, [false, true]);
         let psnr = [curve("training batch", &training, 0), curve("validation", &validation, 1)];
-        sheet::grid(&[(&loss, ""), (&sheet::plot_curve("PSNR (dB)", &psnr, size, false), "")], 1)
+        sheet::grid(&[(&loss, ""), (&sheet::plot_curve("PSNR (dB)", &psnr, size, [false; 2]), "")], 1)
     }
 }
 
