@@ -366,8 +366,10 @@ impl Bench<'_> {
                         views.iter().any(|other| (&other.instance, &other.view) == (&view.instance, &view.view))
                     };
                     let there: Vec<&ViewReport> = ours.views.iter().filter(is_there).collect();
-                    if there.len() < ours.views.len() {
-                        rows.push(row("default, same views", &ours.setting, &there));
+                    let row = row("default, same views", &ours.setting, &there);
+                    // Once for all losses.
+                    if there.len() < ours.views.len() && !rows.contains(&row) {
+                        rows.push(row);
                     }
                 }
             }
