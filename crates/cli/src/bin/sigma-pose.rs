@@ -25,8 +25,6 @@ enum Command {
     /// Measure the errors on a data set, by the paper's protocol.
     Evaluate(evaluate::Evaluate),
     /// Compare estimates with known poses, so that others come with standard deviations and a verdict.
-    ///
-    /// For searches of the same --effort: deviations come from how the loss bends at the end, and a search of fewer steps takes it for flatter.
     Calibrate(calibrate::Calibrate),
     /// Render an object from any side.
     Render(render::Render),
