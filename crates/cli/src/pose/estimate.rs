@@ -96,6 +96,8 @@ struct ImageReport {
     confidence: Option<Confidence>,
     /// The best pose elsewhere that the search followed to the end.
     rival: Option<Rival>,
+    /// 2 if a second, exhaustive search has found it, for the first one's pose was not to be trusted.
+    searches: usize,
     /// Number of the winning start.
     start: usize,
     error: Option<PoseError>,
@@ -159,9 +161,13 @@ pub fn run(args: &Estimate) -> Result<bool> {
 
     let bar = progress(options.phases.iter().map(|phase| u64::from(phase.steps)).sum(), "steps");
     let mut log = Log::default();
-    let found = args.search.run(&options, on, &pictures, &starts, |mut progress| {
+    let found = args.search.run_until_trusted(on, &pictures, &starts, |searches, mut progress| {
+        if searches > 0 && progress.step == 0 {
+            bar.set_length(u64::from(progress.steps));
+            bar.set_message("once more, exhaustively");
+        }
         bar.set_position(progress.step.into());
-        if args.record.is_some() { log.note(&mut progress) } else { Ok(()) }
+        if args.record.is_some() { log.note(searches, &mut progress) } else { Ok(()) }
     })?;
     bar.finish_and_clear();
 
@@ -264,6 +270,7 @@ fn report(
             trusted: found.trusted,
             confidence: found.confidence,
             rival: found.estimate.rival().map(rival),
+            searches: found.searches,
             start: found.estimate.ranking[0].start,
             error: error(&found.world_from_camera),
             ranking: found.estimate.ranking.iter().map(ranked).collect(),

@@ -109,6 +109,8 @@ pub(super) struct ViewReport {
     pub within_95: Option<bool>,
     /// By which part the loss is higher at the best pose elsewhere.
     pub rival_higher: Option<f64>,
+    /// 2 if a second, exhaustive search has found the pose, for the first one's was not to be trusted.
+    pub searches: usize,
     pub seconds: f64,
     /// Rows of the estimate.
     pub world_from_camera: [[f64; 4]; 4],
@@ -132,7 +134,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     }
     let engine = args.engine.open()?;
     let on = On { engine: &engine, model: &model, side };
-    let found = views::search(&asked, on, &args.search, &args.starts, &notation, |_, _| Ok(()))?;
+    let found = views::search(&asked, on, &args.search, &args.starts, &notation, |_, _, _| Ok(()))?;
 
     let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();
     for ((views, source), found) in asked.iter().zip(sources).zip(found) {
@@ -197,6 +199,7 @@ pub(super) fn view_report(
         confidence: found.confidence,
         within_95,
         rival_higher: found.estimate.rival().map(|(_, higher)| higher),
+        searches: found.searches,
         seconds: found.seconds,
         world_from_camera: convention.of_ours(found.world_from_camera).transpose().to_cols_array_2d(),
         source_from_camera: source.map(|source| source.rows(&found.world_from_camera)),

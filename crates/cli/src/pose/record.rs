@@ -23,6 +23,8 @@ const FRAMES: usize = 40;
 
 /// Poses and losses of all hypotheses at one evaluation.
 struct Moment {
+    /// Searches that had gone before.
+    searches: usize,
     step: u32,
     hypotheses: Vec<(usize, usize)>,
     losses: Vec<f64>,
@@ -43,25 +45,25 @@ struct Point {
 
 impl Log {
     /// Notes where all hypotheses are.
-    pub fn note(&mut self, progress: &mut Progress) -> std::result::Result<(), Error> {
+    pub fn note(&mut self, searches: usize, progress: &mut Progress) -> std::result::Result<(), Error> {
         let (losses, poses) = progress.descent.standing()?.into_iter().unzip();
-        self.0.push(Moment { step: progress.step, hypotheses: progress.hypotheses.to_vec(), losses, poses });
+        self.0.push(Moment { searches, step: progress.step, hypotheses: progress.hypotheses.to_vec(), losses, poses });
         Ok(())
     }
 
-    /// The way of a start of a picture.
-    fn path(&self, picture: usize, start: usize) -> Vec<Point> {
+    /// The way of a start of a picture, in the search that has found its pose.
+    fn path(&self, picture: usize, start: usize, found: &Found) -> Vec<Point> {
         let point = |moment: &Moment| {
             let i = moment.hypotheses.iter().position(|&name| name == (picture, start))?;
             Some(Point { step: moment.step, loss: moment.losses[i], world_from_camera: moment.poses[i].to_matrix() })
         };
-        self.0.iter().filter_map(point).collect()
+        self.0.iter().filter(|moment| moment.searches + 1 == found.searches).filter_map(point).collect()
     }
 
     /// Writes `NAME.png` and `NAME.gif` of picture number `index` to `dir`.
     pub fn write(&self, dir: &Path, index: usize, picture: &Picture, found: &Found, on: On) -> Result<()> {
         let winner = found.estimate.ranking[0].start;
-        let mut path = self.path(index, winner);
+        let mut path = self.path(index, winner, found);
         let last = path.last().map_or(0, |point| point.step);
         path.push(Point { step: last, loss: found.estimate.loss, world_from_camera: found.world_from_camera });
         let chosen = frames(&path);
@@ -196,7 +198,8 @@ impl Page<'_> {
         let points = |path: &[Point], until: u32| -> Vec<_> {
             path.iter().filter(|point| point.step <= until).map(|point| (f64::from(point.step), point.loss)).collect()
         };
-        let mut paths: Vec<_> = ranking.iter().map(|r| points(&self.log.path(self.index, r.start), u32::MAX)).collect();
+        let mut paths: Vec<_> =
+            ranking.iter().map(|r| points(&self.log.path(self.index, r.start, self.found), u32::MAX)).collect();
         // The winner is drawn last, over the others.
         paths.reverse();
         paths.push(points(self.path, step));

@@ -42,7 +42,8 @@ pub struct SearchArgs {
     /// steps of Adam on the camera's six numbers for every start, on all pixels; the last step counts.
     #[arg(long, value_enum, default_value_t = Preset::Default)]
     preset: Preset,
-    /// How hard the default preset tries: for poses that are roughly known, in general, for what that has lost.
+    /// How hard the default preset tries: for poses that are roughly known, in general, for what that has lost. `normal` is followed by
+    /// `exhaustive` for a picture whose pose is not to be trusted.
     #[arg(long, value_enum, default_value_t = HowHard::Normal)]
     effort: HowHard,
     /// How `--preset paper` compares picture and render. Default: mae. `gmsd` implies `--stride 1`.
@@ -209,6 +210,35 @@ impl SearchArgs {
         Ok(found.map(|((estimate, render), picture)| self.found(model, picture, estimate, render, seconds)).collect())
     }
 
+    /// The same, and once more, exhaustively, where the normal effort has found nothing to be trusted. `observe` is also told how many searches
+    /// for a picture have gone before, and sees them under the same numbers.
+    pub fn run_until_trusted(
+        &self,
+        on: On,
+        pictures: &[Picture],
+        starts: &[Vec<DMat4>],
+        mut observe: impl FnMut(usize, Progress) -> std::result::Result<(), Error>,
+    ) -> Result<Vec<Found>> {
+        let options = self.options()?;
+        let mut all = self.run(&options, on, pictures, starts, |progress| observe(0, progress))?;
+        let is_normal = options == Options { seed: self.seed, ..Options::of(Effort::Normal) };
+        let exhaustive = Options { seed: self.seed, ..Options::of(Effort::Exhaustive) };
+        for (i, found) in all.iter_mut().enumerate().filter(|(_, found)| is_normal && !found.trusted) {
+            let mut again = self.run(&exhaustive, on, &pictures[i..=i], &starts[i..=i], |progress| {
+                let hypotheses: Vec<_> = progress.hypotheses.iter().map(|(_, start)| (i, *start)).collect();
+                observe(1, Progress { hypotheses: &hypotheses, ..progress })
+            })?;
+            let again = again.remove(0);
+            let seconds = found.seconds + again.seconds;
+            // The first search's pose stays where the second has found no better one.
+            if again.estimate.loss < found.estimate.loss {
+                *found = Found { searches: 2, ..again };
+            }
+            found.seconds = seconds;
+        }
+        Ok(all)
+    }
+
     /// Estimates the pose of an object that the model was not trained on. The model with the object is returned too.
     pub fn run_unseen(
         &self,
@@ -236,7 +266,7 @@ impl SearchArgs {
         let instance = model.instance_name(picture.instance);
         let confidence = calibration.and_then(|calibration| Confidence::of(&estimate, &instance, calibration));
         let world_from_camera = estimate.pose.to_matrix();
-        Found { world_from_camera, estimate, rgb: render.rgb, unexplained, trusted, confidence, seconds }
+        Found { world_from_camera, estimate, rgb: render.rgb, unexplained, trusted, confidence, searches: 1, seconds }
     }
 
     /// Whether an estimate is to be trusted.
@@ -323,7 +353,9 @@ pub struct Found {
     pub trusted: bool,
     /// How far off the pose may be, if the model is calibrated.
     pub confidence: Option<Confidence>,
-    /// Seconds of the search, a picture's share of its batch.
+    /// Which search this is the end of, see [`SearchArgs::run_until_trusted`].
+    pub searches: usize,
+    /// Seconds of all searches, a picture's share of their batch.
     pub seconds: f64,
 }
 
@@ -441,6 +473,40 @@ mod tests {
         // Pictures of data sets have their principal point there: nothing is turned.
         let whole = picture(Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.0 });
         assert_eq!(starts(&Picture { distance: Some(1.3), ..whole }).unwrap(), around84(1.3));
+    }
+
+    #[test]
+    fn what_is_not_trusted_is_searched_for_once_more() {
+        let model = Model::init(&ModelConfig { hidden: 8, latent: 4, instances: 1, tracing_steps: 2, density: true }, 3).unwrap();
+        let engine = Engine::cpu();
+        let on = On { engine: &engine, model: &model, side: 8 };
+        let of = |shade: f32| {
+            let seen = picture(Intrinsics { fx: 9.0, fy: 9.0, cx: 4.0, cy: 4.0, pixel_center: 0.0 });
+            Picture { rgb: (0..192).map(|k| shade - (k % 7) as f32 / 9.0).collect(), ..seen }
+        };
+        // The searches, the images, and the losses that a call comes across.
+        let searched = |flags: &str| {
+            let search = Flags::parse_from(format!("sigma-pose {flags}").split(' ')).search;
+            let starts = vec![vec![fixed24(1.3)[5]]; 2];
+            let (mut seen, mut lowest) = (std::collections::BTreeSet::new(), [f64::INFINITY; 2]);
+            let observe = |searches: usize, progress: Progress| {
+                for ((query, _), (loss, _)) in progress.hypotheses.iter().zip(progress.descent.standing()?) {
+                    seen.insert((searches, *query));
+                    if progress.step == progress.steps {
+                        lowest[*query] = lowest[*query].min(loss);
+                    }
+                }
+                Ok(())
+            };
+            let found = search.run_until_trusted(on, &[of(0.9), of(0.4)], &starts, observe).unwrap();
+            assert_eq!([found[0].estimate.loss, found[1].estimate.loss], lowest, "{flags}");
+            seen.into_iter().collect::<Vec<_>>()
+        };
+        assert_eq!(searched("--accept 1e9"), [(0, 0), (0, 1)]);
+        assert_eq!(searched("--accept 1e-9"), [(0, 0), (0, 1), (1, 0), (1, 1)]);
+        for plain in ["--effort fast", "--effort exhaustive", "--steps 9", "--no-cull", "--preset paper --steps 9"] {
+            assert_eq!(searched(&format!("--accept 1e-9 {plain}")), [(0, 0), (0, 1)], "{plain}");
+        }
     }
 
     #[test]

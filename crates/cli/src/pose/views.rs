@@ -53,15 +53,15 @@ pub fn open(model: &Model, data: &Path, instances: u32, views: u32) -> Result<(u
     Ok((side, all))
 }
 
-/// Searches for all views, instance by instance, with a bar on stderr. `observe` also gets the number of the instance. Returns what was found
-/// for the views of each.
+/// Searches for all views, instance by instance, with a bar on stderr. `observe` also gets the number of the instance, and
+/// how many searches have gone before. Returns what was found for the views of each.
 pub fn search(
     asked: &[Views],
     on: On,
     args: &SearchArgs,
     starts: &Starts,
     notation: &Notation,
-    mut observe: impl FnMut(usize, Progress) -> std::result::Result<(), Error>,
+    mut observe: impl FnMut(usize, usize, Progress) -> std::result::Result<(), Error>,
 ) -> Result<Vec<Vec<Found>>> {
     let options = args.options()?;
     // All starts are known before the first is searched for.
@@ -75,9 +75,13 @@ pub fn search(
     let mut found = Vec::new();
     for (i, (Views { name, pictures, .. }, starts)) in asked.iter().zip(&all_starts).enumerate() {
         bar.set_message(name.clone());
-        found.push(args.run(&options, on, pictures, starts, |progress| {
-            bar.set_position(i as u64 * steps + u64::from(progress.step));
-            observe(i, progress)
+        found.push(args.run_until_trusted(on, pictures, starts, |searches, progress| {
+            if searches == 0 {
+                bar.set_position(i as u64 * steps + u64::from(progress.step));
+            } else {
+                bar.set_message(format!("{name}, once more"));
+            }
+            observe(i, searches, progress)
         })?);
     }
     bar.finish_and_clear();
