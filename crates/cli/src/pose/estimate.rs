@@ -164,7 +164,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let found = args.search.run_until_trusted(on, &pictures, &starts, |searches, mut progress| {
         if searches > 0 && progress.step == 0 {
             bar.set_length(u64::from(progress.steps));
-            bar.set_message("once more, exhaustively");
+            bar.set_message(format!("{}, once more", pictures[progress.hypotheses[0].0].name));
         }
         bar.set_position(progress.step.into());
         if args.record.is_some() { log.note(searches, &mut progress) } else { Ok(()) }
