@@ -105,7 +105,7 @@ pub fn run(args: &Calibrate) -> Result<bool> {
         *pictures = spread(std::mem::take(pictures), args.views as usize);
         *truths = spread(std::mem::take(truths), args.views as usize);
     }
-    let found = views::search(&asked, on, &args.search, &args.starts, &Notation::default(), |_, _, _| Ok(()))?;
+    let found = views::search(&asked, on, &args.search.trusting(), &args.starts, &Notation::default(), |_, _, _| Ok(()))?;
     let mut known = Vec::new();
     for (Views { name, pictures, truths, .. }, found) in asked.iter().zip(&found) {
         let views = found.iter().zip(truths).zip(pictures);

@@ -159,6 +159,11 @@ impl SearchArgs {
         Ok(SearchArgs { preset, loss, ..self.clone() })
     }
 
+    /// The same, with every pose trusted that has a loss: for those who have yet to learn what to trust.
+    pub fn trusting(&self) -> Self {
+        SearchArgs { accept: Some(f64::INFINITY), ..self.clone() }
+    }
+
     /// The settings of the estimator.
     pub fn options(&self) -> Result<Options> {
         let mut options = match self.preset {
