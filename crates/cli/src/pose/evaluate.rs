@@ -51,7 +51,8 @@ pub struct Evaluate {
     /// For --tables: instances that the model was not trained on; they are fitted to two views each (the paper's Table 2).
     #[arg(long, value_name = "DIR", requires = "tables")]
     pub(super) heldout: Option<PathBuf>,
-    /// For --tables: how many of all views the paper's preset searches for, which takes minutes a view on a CPU. Default: all.
+    /// For --tables: for how many of the views the paper's preset searches from `neighbor4`, half a minute a view on a CPU; from
+    /// `fixed24`, six times the work, for a sixth of them. Default: all.
     #[arg(long, value_name = "N", requires = "tables", value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) paper_views: Option<u32>,
     /// Count poses as right from which the object looks the same: turns about its axes that the model's own views do not show. Some
