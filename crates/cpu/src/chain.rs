@@ -12,6 +12,10 @@ const BLOCK_ROWS: usize = 256;
 /// The same for rows with more values than [`NARROW`], whose weights are large: packing them for a product must be worth it.
 const WIDE_BLOCK_ROWS: usize = 512;
 const NARROW: usize = 128;
+/// With as many blocks for each thread it does not matter that one thread has one more.
+const FEW_BLOCKS: usize = 8;
+/// A block of fewer is not worth another thread.
+const FEWEST_ROWS: usize = 32;
 
 /// Rows of a block where a row has up to `values` values.
 fn block_rows(values: usize) -> usize {
@@ -141,7 +145,11 @@ impl Chain {
                 chains.push(Chain::begin(number, step, split));
             }
         }
-        chains.iter_mut().for_each(Chain::cut);
+        let threads = rayon::current_num_threads();
+        for chain in &mut chains {
+            let values = chain.places.iter().map(|place| place.width).max().unwrap_or(0);
+            chain.blocks = blocks(chain.rows, chain.rows_per_group, values, threads);
+        }
         chains
     }
 
@@ -184,12 +192,44 @@ impl Chain {
         self.rows_per_group = self.rows_per_group.or(split.rows_per_group);
         true
     }
+}
 
-    /// Makes the blocks, each of rows of one group.
-    fn cut(&mut self) {
-        let group = self.rows_per_group.unwrap_or(self.rows).max(1);
-        let most = block_rows(self.places.iter().map(|place| place.width).max().unwrap_or(0));
-        let of_group = |first: usize| (first..first + group).step_by(most).map(move |row| row..(first + group).min(row + most));
-        self.blocks = (0..self.rows).step_by(group).flat_map(of_group).collect();
+/// Blocks of `rows` rows with up to `values` values, each of rows of one group; where there are few, as many for each thread.
+fn blocks(rows: usize, rows_per_group: Option<usize>, values: usize, threads: usize) -> Vec<Range<usize>> {
+    let group = rows_per_group.unwrap_or(rows).max(1);
+    let (groups, whole) = (rows.div_ceil(group), group.div_ceil(block_rows(values)));
+    let even = (whole..whole + threads).find(|count| (groups * count).is_multiple_of(threads)).unwrap_or(whole);
+    let few = groups * whole < FEW_BLOCKS * threads;
+    let count = if few { even.min(group / FEWEST_ROWS).max(whole) } else { whole };
+    let of_group = |first: usize| {
+        let step = group.div_ceil(count);
+        (first..first + group).step_by(step).map(move |row| row..(first + group).min(row + step))
+    };
+    (0..rows).step_by(group).flat_map(of_group).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Rows of the blocks on two threads.
+    fn lengths(rows: usize, rows_per_group: Option<usize>, values: usize) -> Vec<usize> {
+        let blocks = blocks(rows, rows_per_group, values, 2);
+        assert!(blocks.windows(2).all(|pair| pair[0].end == pair[1].start), "in order, no row twice");
+        assert_eq!(blocks.iter().map(ExactSizeIterator::len).sum::<usize>(), rows, "all rows");
+        blocks.iter().map(ExactSizeIterator::len).collect()
+    }
+
+    #[test]
+    fn few_rows_are_shared_evenly() {
+        assert_eq!(lengths(512, None, 64), [256, 256]);
+        assert_eq!(lengths(256, Some(256), 64), [128, 128], "one image of 16 x 16 pixels");
+        assert_eq!(lengths(768, Some(256), 64), [128; 6], "three of them");
+        assert_eq!(lengths(600, None, 64), [150; 4]);
+        assert_eq!(lengths(601, None, 64), [151, 151, 151, 148]);
+        assert_eq!(lengths(1024, None, 256), [512, 512]);
+        assert_eq!(lengths(40, None, 64), [40], "not worth two threads");
+        assert_eq!(lengths(33 * 256, None, 64), [256; 33], "many blocks stay large");
+        assert_eq!(lengths(0, None, 64), [0usize; 0]);
     }
 }
