@@ -88,11 +88,11 @@ fn a_run_repeats_bit_for_bit() {
     }
 }
 
+/// With the shipped model: what a short training arrives at changes with the last bit of a gradient, and with it where poses lead.
 #[test]
 fn a_pose_near_the_truth_comes_nearer() {
-    let mut trainer = trainer(&Engine::cpu());
-    train(&mut trainer, 250);
-    let model = trainer.model().unwrap();
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../assets/models/compact.safetensors");
+    let model = &Model::load(path.as_ref()).unwrap();
     for engine in engines() {
         // Looked for is what the model itself shows: how good it is does not matter here.
         let truths: Vec<_> = [1, 10, 13].map(|k| camera::fixed24(1.3)[k]).into();
@@ -108,15 +108,15 @@ fn a_pose_near_the_truth_comes_nearer() {
         let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2);
         let starts: Vec<Pose6> = truths.iter().map(|truth| Pose6::from_matrix(&(turn * *truth))).collect();
         descent.set_poses(&starts).unwrap();
-        for _ in 0..30 {
+        for _ in 0..60 {
             descent.evaluate().unwrap();
             descent.descend().unwrap();
         }
         for ((best, start), truth) in descent.standing().unwrap().iter().zip(&starts).zip(&truths) {
             let [before, after] = [start, &best.1].map(|pose| camera::pose_error(&pose.to_matrix(), truth).0);
             println!("{engine}: {before:.1}° to {after:.2}°");
-            // Measured on both: 0.02° to 4.8°.
-            assert!(after < 0.5 * before, "{engine}: {before}° to {after}°");
+            // Measured on both: 0.03° at most.
+            assert!(after < 0.1 * before, "{engine}: {before}° to {after}°");
         }
     }
 }
