@@ -115,6 +115,16 @@ table! {
     LAYER_NORM_RELU_BACKWARD_AFFINE = "layer_norm_relu"/"backward_affine", LayerNormParams, tile [64, 1, 1],
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32),
         or "backward_affine_vec4" tile [256, 1, 1], when [FeaturesMultipleOf4];
+    /// The first layer of a network of points, where no weight takes a gradient: linear map, layer norm and ReLU in one, and nothing kept.
+    /// `z = W x + b`, `y = relu(gamma (z - mean) rstd + beta)`; `x [rows, 3]`, `affine [2, features]` → `y [rows, features]`.
+    /// Extent: rows of a group × 1 × groups.
+    POINT_LAYER_FORWARD = "point_layer"/"forward", PointLayerParams, tile FLAT,
+        (x: f32, weights: f32, slots: u32, affine: f32) -> (y: f32),
+        or "forward_subgroup" tile [256, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+    /// `d_x (+)= Wᵀ d_z`, `d_z` as the gradient of `layer_norm_relu`. Extent: rows of a group × 1 × groups.
+    POINT_LAYER_BACKWARD_INPUT = "point_layer"/"backward_input", PointLayerParams, tile FLAT,
+        (x: f32, weights: f32, slots: u32, affine: f32, d_y: f32) -> (d_x: f32),
+        or "backward_input_subgroup" tile [256, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Gates in the order i, f, g, o: `c = σ(f) c_prev + σ(i) tanh(g)`, `h = σ(o) tanh(c)`.
     /// `gates [rows, 4·hidden]` before activation, `c_prev [rows, hidden]` → `h, c [rows, hidden]`. Extent: rows · hidden.
     LSTM_CELL_FORWARD = "lstm_cell"/"forward", LstmParams, tile FLAT,

@@ -24,6 +24,7 @@ mod linear;
 mod lockstep;
 mod lstm_cell;
 mod pack_rgba8;
+mod point_layer;
 mod pose;
 mod rays;
 mod sum;
@@ -59,6 +60,8 @@ static ALL: &[&KernelTest] = &[
     &layer_norm_relu::FORWARD,
     &layer_norm_relu::BACKWARD_INPUT,
     &layer_norm_relu::BACKWARD_AFFINE,
+    &point_layer::FORWARD,
+    &point_layer::BACKWARD_INPUT,
     &lstm_cell::FORWARD,
     &lstm_cell::BACKWARD,
     &advance::FORWARD,
@@ -205,7 +208,7 @@ fn every_kernel_has_a_test_and_every_variant_a_planted_fault() {
 #[test]
 fn subgroups_of_several_teams() {
     let mut tests = std::process::Command::new(std::env::current_exe().expect("this program has a path"));
-    tests.args(["linear::", "layer_norm_relu::", "--quiet"]).env("LP_NATIVE_VECTOR_WIDTH", "512");
+    tests.args(["linear::", "layer_norm_relu::", "point_layer::", "--quiet"]).env("LP_NATIVE_VECTOR_WIDTH", "512");
     let output = tests.output().expect("this program runs");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));
 }

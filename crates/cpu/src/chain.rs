@@ -5,7 +5,7 @@ use std::cell::Cell;
 use std::ops::Range;
 
 use srn_plan::{BufferId, Step};
-use srn_shaders::{ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointParams, RowsParams};
+use srn_shaders::{ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams, PointParams, RowsParams};
 
 /// Rows of a block: what it reads and writes in a step should stay in a core's cache.
 const BLOCK_ROWS: usize = 256;
@@ -92,7 +92,7 @@ macro_rules! rows_of_groups {
     };
 }
 
-rows_of_groups!(ImageLossParams LinearParams RowsParams);
+rows_of_groups!(ImageLossParams LinearParams PointLayerParams RowsParams);
 
 /// How a step falls apart into rows.
 #[derive(Debug)]

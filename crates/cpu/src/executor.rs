@@ -2,7 +2,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 use srn_plan::{BufferId, Element, Executor, ExecutorError, Plan, StageId, Step};
-use srn_shaders::{ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointParams, RowsParams};
+use srn_shaders::{ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams, PointParams, RowsParams};
 
 use crate::chain::{Chain, Link, RowWise, Split};
 use crate::{Real, chain, ops};
@@ -357,6 +357,9 @@ references! {
             |p: LayerNormParams| [p.features, 0, p.features, 2];
         "layer_norm_relu/backward_input" => layer_norm_relu::backward_input(f f f f) -> (f_mut),
             |p: LayerNormParams| [p.features, 2, 0, p.features, p.features];
+        "point_layer/forward" => point_layer::forward(f f u f) -> (f_mut), |p: PointLayerParams| [3, 0, 0, 0, p.features];
+        "point_layer/backward_input" => point_layer::backward_input(f f u f f) -> (f_mut),
+            |p: PointLayerParams| [3, 0, 0, 0, p.features, 3];
         "lstm_cell/forward" => lstm_cell::forward(f f) -> (f_mut f_mut), |p: LstmParams| [4 * p.hidden, p.hidden, p.hidden, p.hidden];
         "lstm_cell/backward" => lstm_cell::backward(f f f f f) -> (f_mut f_mut),
             |p: LstmParams| [4 * p.hidden, p.hidden, p.hidden, p.hidden, p.hidden, 4 * p.hidden, p.hidden];

@@ -6,7 +6,7 @@ use srn_shaders::LayerNormParams;
 
 use super::chunk_of;
 use crate::Real;
-use crate::simd::vectorised;
+use crate::simd::{sum, vectorised};
 
 const EPSILON: f64 = 1e-5;
 
@@ -16,70 +16,98 @@ pub fn forward<T: Real>(p: LayerNormParams, x: &[T], affine: &[T], y: &mut [T], 
     let (x, affine, y, stats) = (&x[..rows * width], &affine[..2 * width], &mut y[..rows * width], &mut stats[..2 * rows]);
     if let [Some(x), Some(affine)] = [x, affine].map(T::singles)
         && let [Some(y), Some(stats)] = [&mut *y, &mut *stats].map(T::singles_mut)
+        && Arch::new().dispatch(InRegisters { width, rows: Forward { x, affine, y, stats } })
     {
-        return Arch::new().dispatch(Forward { width, x, affine, y, stats });
+        return;
     }
-    let (gamma, beta) = affine.split_at(width);
-    let count = T::of(width as f64);
-    for ((x, y), stats) in x.chunks_exact(width).zip(y.chunks_exact_mut(width)).zip(stats.chunks_exact_mut(2)) {
-        let mean = x.iter().copied().sum::<T>() / count;
-        let variance = x.iter().map(|&x| (x - mean) * (x - mean)).sum::<T>() / count;
-        let rstd = T::one() / (variance + T::of(EPSILON)).sqrt();
-        for (((y, &x), &gamma), &beta) in y.iter_mut().zip(x).zip(gamma).zip(beta) {
-            let value = (x - mean) * rstd * gamma + beta;
-            // A NaN is no number to hide: it goes on.
-            *y = if value < T::zero() { T::zero() } else { value };
+    forward_rows(x, affine, y, stats);
+}
+
+vectorised! {
+    fn forward_rows<T: Real>(x: &[T], affine: &[T], y: &mut [T], stats: &mut [T]) {
+        let width = affine.len() / 2;
+        let (gamma, beta) = affine.split_at(width);
+        let count = T::of(width as f64);
+        for ((x, y), stats) in x.chunks_exact(width).zip(y.chunks_exact_mut(width)).zip(stats.chunks_exact_mut(2)) {
+            let mean = sum(x, x, |x, _| x) / count;
+            let variance = sum(x, x, |x, _| (x - mean) * (x - mean)) / count;
+            let rstd = T::one() / (variance + T::of(EPSILON)).sqrt();
+            for (((y, &x), &gamma), &beta) in y.iter_mut().zip(x).zip(gamma).zip(beta) {
+                let value = (x - mean) * rstd * gamma + beta;
+                // A NaN is no number to hide: it goes on.
+                *y = if value < T::zero() { T::zero() } else { value };
+            }
+            stats.copy_from_slice(&[mean, rstd]);
         }
-        stats.copy_from_slice(&[mean, rstd]);
     }
 }
 
-/// [`forward`] with the processor's vectors: whole ones of a row, then what is left of it.
-struct Forward<'a> {
+/// Rows that are whole numbers of the processor's vectors, few enough to stay in registers.
+trait Rows {
+    /// All rows, of `V` vectors each.
+    fn run<S: Simd, const V: usize>(self, simd: S);
+}
+
+/// Runs `rows` of `width` values, if they are such rows, and says whether they are.
+struct InRegisters<R> {
     width: usize,
+    rows: R,
+}
+
+impl<R: Rows> WithSimd for InRegisters<R> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> bool {
+        match self.width / S::F32_LANES {
+            _ if !self.width.is_multiple_of(S::F32_LANES) => return false,
+            1 => self.rows.run::<S, 1>(simd),
+            2 => self.rows.run::<S, 2>(simd),
+            4 => self.rows.run::<S, 4>(simd),
+            8 => self.rows.run::<S, 8>(simd),
+            16 => self.rows.run::<S, 16>(simd),
+            _ => return false,
+        }
+        true
+    }
+}
+
+fn rows_of<S: Simd, const V: usize>(values: &[f32]) -> &[[S::f32s; V]] {
+    S::as_simd_f32s(values).0.as_chunks().0
+}
+
+/// [`forward`] with the processor's vectors, for rows of so many that they stay in registers.
+struct Forward<'a> {
     x: &'a [f32],
     affine: &'a [f32],
     y: &'a mut [f32],
     stats: &'a mut [f32],
 }
 
-impl WithSimd for Forward<'_> {
-    type Output = ();
-
+impl Rows for Forward<'_> {
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let width = self.width;
-        let (gamma, beta) = self.affine.split_at(width);
-        let [(gamma, gamma_rest), (beta, beta_rest)] = [gamma, beta].map(S::as_simd_f32s);
-        let count = width as f32;
+    fn run<S: Simd, const V: usize>(self, simd: S) {
+        let inverse = 1.0 / (V * S::F32_LANES) as f32;
         let zero = simd.splat_f32s(0.0);
-        for ((x, y), stats) in self.x.chunks_exact(width).zip(self.y.chunks_exact_mut(width)).zip(self.stats.chunks_exact_mut(2))
-        {
-            let (x, x_rest) = S::as_simd_f32s(x);
-            let (y, y_rest) = S::as_mut_simd_f32s(y);
-            let (mut sum, mut squares) = (zero, zero);
-            for &x in x {
-                sum = simd.add_f32s(sum, x);
+        let [gamma, beta] = *rows_of::<S, V>(self.affine) else { unreachable!("two rows") };
+        let y = S::as_mut_simd_f32s(self.y).0.as_chunks_mut::<V>().0;
+        for ((&x, y), stats) in rows_of::<S, V>(self.x).iter().zip(y).zip(self.stats.as_chunks_mut().0) {
+            let (mut sum, mut squares, mut centred) = (zero, zero, x);
+            for v in 0..V {
+                sum = simd.add_f32s(sum, x[v]);
             }
-            let mean = (simd.reduce_sum_f32s(sum) + x_rest.iter().sum::<f32>()) / count;
-            let means = simd.splat_f32s(mean);
-            for &x in x {
-                let x = simd.sub_f32s(x, means);
-                squares = simd.mul_add_e_f32s(x, x, squares);
+            let mean = simd.reduce_sum_f32s(sum) * inverse;
+            for v in 0..V {
+                centred[v] = simd.sub_f32s(x[v], simd.splat_f32s(mean));
+                squares = simd.mul_add_e_f32s(centred[v], centred[v], squares);
             }
-            let rest = x_rest.iter().map(|&x| (x - mean) * (x - mean)).sum::<f32>();
-            let rstd = 1.0 / ((simd.reduce_sum_f32s(squares) + rest) / count + EPSILON as f32).sqrt();
-            let rstds = simd.splat_f32s(rstd);
-            for (((y, &x), &gamma), &beta) in y.iter_mut().zip(x).zip(gamma).zip(beta) {
-                let normalised = simd.mul_f32s(simd.sub_f32s(x, means), rstds);
-                let value = simd.mul_add_e_f32s(normalised, gamma, beta);
-                *y = simd.select_f32s(simd.less_than_f32s(value, zero), zero, value);
+            let rstd = 1.0 / (simd.reduce_sum_f32s(squares) * inverse + EPSILON as f32).sqrt();
+            for v in 0..V {
+                let normalised = simd.mul_f32s(centred[v], simd.splat_f32s(rstd));
+                let value = simd.mul_add_e_f32s(normalised, gamma[v], beta[v]);
+                y[v] = simd.select_f32s(simd.less_than_f32s(value, zero), zero, value);
             }
-            for (((y, &x), &gamma), &beta) in y_rest.iter_mut().zip(x_rest).zip(gamma_rest).zip(beta_rest) {
-                let value = (x - mean) * rstd * gamma + beta;
-                *y = if value < 0.0 { 0.0 } else { value };
-            }
-            stats.copy_from_slice(&[mean, rstd]);
+            *stats = [mean, rstd];
         }
     }
 }
@@ -91,29 +119,36 @@ pub fn backward_input<T: Real>(p: LayerNormParams, x: &[T], stats: &[T], affine:
     let (stats, affine, d_x) = (&stats[..2 * rows], &affine[..2 * width], &mut d_x[..rows * width]);
     if let [Some(x), Some(stats), Some(affine), Some(d_y)] = [x, stats, affine, d_y].map(T::singles)
         && let Some(d_x) = T::singles_mut(&mut *d_x)
+        && Arch::new().dispatch(InRegisters { width, rows: Backward { x, stats, affine, d_y, d_x } })
     {
-        return Arch::new().dispatch(Backward { width, x, stats, affine, d_y, d_x });
+        return;
     }
-    let (gamma, beta) = affine.split_at(width);
-    let count = T::of(width as f64);
-    let rows = x.chunks_exact(width).zip(stats.chunks_exact(2)).zip(d_y.chunks_exact(width)).zip(d_x.chunks_exact_mut(width));
-    for (((x, stats), d_y), d_x) in rows {
-        let normalised = |x: T| (x - stats[0]) * stats[1];
-        for ((((d_x, &x), &d_y), &gamma), &beta) in d_x.iter_mut().zip(x).zip(d_y).zip(gamma).zip(beta) {
-            let live = normalised(x) * gamma + beta > T::zero();
-            *d_x = if live { gamma * d_y } else { T::zero() };
-        }
-        let mean_e = d_x.iter().copied().sum::<T>() / count;
-        let mean_ex = d_x.iter().zip(x).map(|(&e, &x)| e * normalised(x)).sum::<T>() / count;
-        for (d_x, &x) in d_x.iter_mut().zip(x) {
-            *d_x = stats[1] * (*d_x - mean_e - normalised(x) * mean_ex);
+    backward_rows(x, stats, affine, d_y, d_x);
+}
+
+vectorised! {
+    fn backward_rows<T: Real>(x: &[T], stats: &[T], affine: &[T], d_y: &[T], d_x: &mut [T]) {
+        let width = affine.len() / 2;
+        let (gamma, beta) = affine.split_at(width);
+        let count = T::of(width as f64);
+        let rows = x.chunks_exact(width).zip(stats.chunks_exact(2)).zip(d_y.chunks_exact(width)).zip(d_x.chunks_exact_mut(width));
+        for (((x, stats), d_y), d_x) in rows {
+            let normalised = |x: T| (x - stats[0]) * stats[1];
+            for ((((d_x, &x), &d_y), &gamma), &beta) in d_x.iter_mut().zip(x).zip(d_y).zip(gamma).zip(beta) {
+                let live = normalised(x) * gamma + beta > T::zero();
+                *d_x = if live { gamma * d_y } else { T::zero() };
+            }
+            let mean_e = sum(d_x, d_x, |e, _| e) / count;
+            let mean_ex = sum(d_x, x, |e, x| e * normalised(x)) / count;
+            for (d_x, &x) in d_x.iter_mut().zip(x) {
+                *d_x = stats[1] * (*d_x - mean_e - normalised(x) * mean_ex);
+            }
         }
     }
 }
 
-/// [`backward_input`] with the processor's vectors.
+/// [`backward_input`] with the processor's vectors, as [`Forward`].
 struct Backward<'a> {
-    width: usize,
     x: &'a [f32],
     stats: &'a [f32],
     affine: &'a [f32],
@@ -121,51 +156,29 @@ struct Backward<'a> {
     d_x: &'a mut [f32],
 }
 
-impl WithSimd for Backward<'_> {
-    type Output = ();
-
+impl Rows for Backward<'_> {
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let width = self.width;
-        let (gamma, beta) = self.affine.split_at(width);
-        let [(gamma, gamma_rest), (beta, beta_rest)] = [gamma, beta].map(S::as_simd_f32s);
-        let count = width as f32;
+    fn run<S: Simd, const V: usize>(self, simd: S) {
+        let inverse = 1.0 / (V * S::F32_LANES) as f32;
         let zero = simd.splat_f32s(0.0);
-        let rows = self.x.chunks_exact(width).zip(self.stats.chunks_exact(2));
-        for (((x, stats), d_y), d_x) in rows.zip(self.d_y.chunks_exact(width)).zip(self.d_x.chunks_exact_mut(width)) {
-            let [(x, x_rest), (d_y, d_y_rest)] = [x, d_y].map(S::as_simd_f32s);
-            let (d_x, d_x_rest) = S::as_mut_simd_f32s(d_x);
-            let [mean, rstd] = [stats[0], stats[1]];
+        let [gamma, beta] = *rows_of::<S, V>(self.affine) else { unreachable!("two rows") };
+        let d_x = S::as_mut_simd_f32s(self.d_x).0.as_chunks_mut::<V>().0;
+        let rows = rows_of::<S, V>(self.x).iter().zip(self.stats.as_chunks().0).zip(rows_of::<S, V>(self.d_y)).zip(d_x);
+        for (((&x, &[mean, rstd]), d_y), d_x) in rows {
             let (means, rstds) = (simd.splat_f32s(mean), simd.splat_f32s(rstd));
-            let (mut sum, mut sum_x) = (zero, zero);
-            for ((((d_x, &x), &d_y), &gamma), &beta) in d_x.iter_mut().zip(x).zip(d_y).zip(gamma).zip(beta) {
-                let x = simd.mul_f32s(simd.sub_f32s(x, means), rstds);
-                let live = simd.greater_than_f32s(simd.mul_add_e_f32s(x, gamma, beta), zero);
-                let e = simd.select_f32s(live, simd.mul_f32s(gamma, d_y), zero);
-                sum = simd.add_f32s(sum, e);
-                sum_x = simd.mul_add_e_f32s(e, x, sum_x);
-                *d_x = e;
+            let (mut sum, mut along, mut normalised, mut e) = (zero, zero, x, x);
+            for v in 0..V {
+                normalised[v] = simd.mul_f32s(simd.sub_f32s(x[v], means), rstds);
+                let live = simd.greater_than_f32s(simd.mul_add_e_f32s(normalised[v], gamma[v], beta[v]), zero);
+                e[v] = simd.select_f32s(live, simd.mul_f32s(gamma[v], d_y[v]), zero);
+                sum = simd.add_f32s(sum, e[v]);
+                along = simd.mul_add_e_f32s(e[v], normalised[v], along);
             }
-            let (mut rest, mut rest_x) = (0.0, 0.0);
-            for ((((d_x, &x), &d_y), &gamma), &beta) in
-                d_x_rest.iter_mut().zip(x_rest).zip(d_y_rest).zip(gamma_rest).zip(beta_rest)
-            {
-                let x = (x - mean) * rstd;
-                let e = if x * gamma + beta > 0.0 { gamma * d_y } else { 0.0 };
-                rest += e;
-                rest_x += e * x;
-                *d_x = e;
-            }
-            let mean_e = (simd.reduce_sum_f32s(sum) + rest) / count;
-            let mean_ex = (simd.reduce_sum_f32s(sum_x) + rest_x) / count;
-            let (means_e, means_ex) = (simd.splat_f32s(mean_e), simd.splat_f32s(mean_ex));
-            for (d_x, &x) in d_x.iter_mut().zip(x) {
-                let x = simd.mul_f32s(simd.sub_f32s(x, means), rstds);
-                let e = simd.negate_mul_add_e_f32s(x, means_ex, simd.sub_f32s(*d_x, means_e));
-                *d_x = simd.mul_f32s(rstds, e);
-            }
-            for (d_x, &x) in d_x_rest.iter_mut().zip(x_rest) {
-                *d_x = rstd * (*d_x - mean_e - (x - mean) * rstd * mean_ex);
+            let mean_e = simd.splat_f32s(simd.reduce_sum_f32s(sum) * inverse);
+            let mean_along = simd.splat_f32s(simd.reduce_sum_f32s(along) * inverse);
+            for v in 0..V {
+                let d = simd.negate_mul_add_e_f32s(normalised[v], mean_along, simd.sub_f32s(e[v], mean_e));
+                d_x[v] = simd.mul_f32s(rstds, d);
             }
         }
     }

@@ -4,7 +4,7 @@ use gemm::{Parallelism, gemm};
 use rayon::prelude::*;
 use srn_shaders::LinearParams;
 
-use super::chunk_of;
+use super::{chunk_of, set_of};
 use crate::Real;
 use crate::chain::is_alone;
 use crate::simd::vectorised;
@@ -46,8 +46,8 @@ fn product<T: Real>([m, n, k]: [usize; 3], c: &mut [T], a: Matrix<T>, b: Matrix<
 
 /// The weights of group `group`.
 fn weights_of<'a, T>(p: LinearParams, weights: &'a [T], slots: &[u32], group: usize) -> &'a [T] {
-    let start = if p.weight_stride == 0 { 0 } else { slots[p.first_group as usize + group] as usize * p.weight_stride as usize };
-    &weights[start..start + (p.out_features * p.in_features + p.out_features) as usize]
+    let length = (p.out_features * p.in_features + p.out_features) as usize;
+    set_of(weights, length, p.weight_stride, slots, p.first_group as usize + group)
 }
 
 /// Within one of many blocks of rows, the thread that works on it; else the library may split the product.

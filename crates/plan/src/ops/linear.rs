@@ -41,14 +41,14 @@ impl Layer {
         self.out_features * self.in_features + self.out_features
     }
 
-    fn stride(&self) -> u32 {
+    pub(super) fn stride(&self) -> u32 {
         match self.sets {
             Sets::Shared => 0,
             Sets::Slots { .. } => self.parameters(),
         }
     }
 
-    fn weights_len(&self) -> usize {
+    pub(super) fn weights_len(&self) -> usize {
         match self.sets {
             Sets::Shared => size([self.parameters()]),
             Sets::Slots { count } => size([count, self.parameters()]),
@@ -56,7 +56,7 @@ impl Layer {
     }
 
     /// Groups do not matter to shared weights: one group of all rows makes the widest dispatch.
-    fn rows(&self, rows: Rows) -> Rows {
+    pub(super) fn rows(&self, rows: Rows) -> Rows {
         match self.sets {
             Sets::Shared => Rows::plain(rows.count()),
             Sets::Slots { .. } => rows,
@@ -77,7 +77,7 @@ impl Layer {
         }
     }
 
-    fn flops(&self, rows: Rows) -> u64 {
+    pub(super) fn flops(&self, rows: Rows) -> u64 {
         2 * u64::from(rows.count()) * u64::from(self.in_features) * u64::from(self.out_features)
     }
 }

@@ -17,6 +17,7 @@ pub mod layer_norm_relu;
 pub mod linear;
 pub mod lstm_cell;
 pub mod pack_rgba8;
+pub mod point_layer;
 pub mod pose;
 pub mod rays;
 pub mod sum;

@@ -1,7 +1,7 @@
 //! Backward pass: [`super::forward`] in reverse.
 
 use srn_plan::ops::layer_norm_relu::Saved as NormSaved;
-use srn_plan::ops::{advance, density_sum, embedding, layer_norm_relu, linear, lstm_cell, rays};
+use srn_plan::ops::{advance, density_sum, embedding, layer_norm_relu, linear, lstm_cell, point_layer, rays};
 use srn_plan::{BufferId, Builder, PlanError, Rows, Tile};
 
 use super::{BlockBuffers, BlockSaved, HyperBuffers, HyperSaved, Network, Saved, Scratch, SourceBuffers, Started};
@@ -147,6 +147,15 @@ fn mlp(
     let mut d = d;
     for (k, (block, block_saved)) in blocks.iter().zip(saved).enumerate().rev() {
         let features = block.layer.out_features;
+        let input = if k == 0 { x } else { saved[k - 1].y };
+        let into = if k == 0 { d_x } else { Some(Into { buffer: inside.d_y, accumulate: false }) };
+        if let Some(affine) = block.of_points(k) {
+            if let Some(Into { buffer, accumulate }) = into {
+                point_layer::backward_input(b, rows, block.layer, input, network.slots, affine, d, buffer, accumulate)?;
+                d = buffer;
+            }
+            continue;
+        }
         if let Some(affine) = block.affine {
             let norm = NormSaved { x: block_saved.z, stats: block_saved.stats, affine };
             if let Some(d_affine) = block.d_affine {
@@ -156,9 +165,7 @@ fn mlp(
             layer_norm_relu::backward_input(b, rows.count(), features, norm, d, inside.d_z)?;
             d = inside.d_z;
         }
-        let input = if k == 0 { x } else { saved[k - 1].y };
         weights(b, rows, block, input, d, inside.partial, started)?;
-        let into = if k == 0 { d_x } else { Some(Into { buffer: inside.d_y, accumulate: false }) };
         if let Some(into) = into {
             linear::backward_input(b, rows, block.layer, d, network.slots, into.buffer, into.accumulate)?;
             d = into.buffer;

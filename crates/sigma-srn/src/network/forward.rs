@@ -3,7 +3,9 @@
 use srn_plan::ops::embedding::Embedding;
 use srn_plan::ops::layer_norm_relu::Saved as NormSaved;
 use srn_plan::ops::rays::Pixels;
-use srn_plan::ops::{advance, density_sum, depth, embedding, layer_norm_relu, linear, lstm_cell, rays, tile as tile_ops};
+use srn_plan::ops::{
+    advance, density_sum, depth, embedding, layer_norm_relu, linear, lstm_cell, point_layer, rays, tile as tile_ops,
+};
 use srn_plan::{BufferId, Builder, PlanError, Rows, StageId, Tile};
 
 use super::{BlockBuffers, BlockSaved, HyperBuffers, HyperSaved, Network, Saved, SourceBuffers};
@@ -88,11 +90,15 @@ fn mlp(
     saved: &[BlockSaved],
 ) -> Result<BufferId, PlanError> {
     let mut x = x;
-    for (block, saved) in blocks.iter().zip(saved) {
-        linear::forward(b, rows, block.layer, x, slots, saved.z, false)?;
-        if let Some(affine) = block.affine {
-            let norm = NormSaved { x: saved.z, stats: saved.stats, affine };
-            layer_norm_relu::forward(b, rows.count(), block.layer.out_features, norm, saved.y)?;
+    for (k, (block, saved)) in blocks.iter().zip(saved).enumerate() {
+        if let Some(affine) = block.of_points(k) {
+            point_layer::forward(b, rows, block.layer, x, slots, affine, saved.y)?;
+        } else {
+            linear::forward(b, rows, block.layer, x, slots, saved.z, false)?;
+            if let Some(affine) = block.affine {
+                let norm = NormSaved { x: saved.z, stats: saved.stats, affine };
+                layer_norm_relu::forward(b, rows.count(), block.layer.out_features, norm, saved.y)?;
+            }
         }
         x = saved.y;
     }

@@ -8,6 +8,7 @@ mod saved;
 use std::collections::HashSet;
 
 use srn_plan::ops::linear::{Layer, Sets};
+use srn_plan::ops::point_layer;
 use srn_plan::{BufferId, Builder, PlanError};
 
 pub(crate) use saved::{BlockSaved, HyperSaved, Saved, Scratch};
@@ -46,6 +47,15 @@ pub(crate) struct BlockBuffers {
     pub d_weights: Option<BufferId>,
     /// Gradient of gamma and beta, if wanted.
     pub d_affine: Option<BufferId>,
+}
+
+impl BlockBuffers {
+    /// Gamma and beta of a network's first layer, if its input are points and it is done in one step: where its weights take no gradient,
+    /// nothing of it need be kept. `number` is that of the layer in its network.
+    pub fn of_points(&self, number: usize) -> Option<BufferId> {
+        let in_one = number == 0 && self.layer.in_features == point_layer::COORDINATES && self.d_weights.is_none();
+        self.affine.filter(|_| in_one)
+    }
 }
 
 /// Codes and hypernetwork.

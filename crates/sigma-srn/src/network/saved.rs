@@ -11,7 +11,7 @@ pub(crate) struct BlockSaved {
     pub z: BufferId,
     /// Mean and rstd `[rows, 2]`, with a norm.
     pub stats: BufferId,
-    /// After norm and ReLU `[rows, out]`; the same as `z` without them.
+    /// After norm and ReLU `[rows, out]`; the same as `z` without them, and where all is done in one step.
     pub y: BufferId,
 }
 
@@ -77,7 +77,7 @@ impl Saved {
                 } else {
                     reused.get(b, ["y even", "y odd"][k % 2], len(widest))?
                 };
-                saved.push(match block.affine {
+                saved.push(match block.affine.filter(|_| block.of_points(k).is_none()) {
                     None => BlockSaved { z: y, stats: y, y },
                     Some(_) if keep_z => BlockSaved {
                         z: b.scratch(format!("{name}.{k} z"), len(width))?,
