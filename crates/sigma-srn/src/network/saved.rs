@@ -214,11 +214,18 @@ impl HyperSaved {
                 let len = slots * block.layer.out_features as usize;
                 saved.push(match block.affine {
                     None => BlockSaved { z: scene.layer.weights, stats: scene.layer.weights, y: scene.layer.weights },
-                    Some(_) => BlockSaved {
-                        z: b.scratch(format!("hyper.{l}.{k} z"), len)?,
-                        stats: b.scratch(format!("hyper.{l}.{k} stats"), 2 * slots)?,
-                        y: b.scratch(format!("hyper.{l}.{k} y"), len)?,
-                    },
+                    Some(_) => {
+                        let y = b.scratch(format!("hyper.{l}.{k} y"), len)?;
+                        // A code of three numbers is a point, too.
+                        match block.of_points(k) {
+                            Some(_) => BlockSaved { z: y, stats: y, y },
+                            None => BlockSaved {
+                                z: b.scratch(format!("hyper.{l}.{k} z"), len)?,
+                                stats: b.scratch(format!("hyper.{l}.{k} stats"), 2 * slots)?,
+                                y,
+                            },
+                        }
+                    }
                 });
             }
             mlps.push(saved);
