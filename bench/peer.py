@@ -2,6 +2,7 @@
 """The network of sigma-srn in plain PyTorch, float32 and eager: the peer that `cargo xtask bench` compares times with.
 
     python3 bench/peer.py check FILE.safetensors...    against golden values; exit 1 beyond a relative difference of 1e-4
+    python3 bench/peer.py chance FILE.safetensors...   how often PyTorch itself parts from golden values, for no more than rounding
     python3 bench/peer.py time --width 64 --json       median seconds of a pose step and of a training step
 
 It serves no other purpose. Both steps come in two versions: "as released" evaluates the scene features f again at every point
@@ -36,6 +37,8 @@ SIDE, HYPOTHESES, INSTANCES, TRACING_STEPS = 64, 5, 9, 10
 LATENT = {64: 32, 256: 256}
 VERSIONS = {"as released": False, "kept": True}
 TOLERANCE = 1e-4
+# What `chance` looks at, and the limits of `cargo xtask golden` for it.
+MOVED = [("trained parameters", 5e-4), ("refined poses", 2e-3)]
 
 
 class Net(nn.Module):
@@ -173,16 +176,21 @@ def read_safetensors(path):
     return tensors, metadata
 
 
-def golden_differences(tensors, metadata, device, keep):
-    """The worst difference of each quantity, relative to the largest expected value of its tensor."""
-    tensors = {name: tensor.to(device) for name, tensor in tensors.items()}
+def golden(tensors, metadata):
+    """Model and batch of a golden file, and its cameras."""
     # The matrices of the file, in.cam2world, were rounded after the golden values were computed.
     intrinsics, cameras = tensors["in.intrinsics"].unsqueeze(3), pose_matrix(tensors["in.pose6"])
     lifted = lift(tensors["in.uv"], intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, 0, 2], intrinsics[:, 1, 2])
     batch = Batch(tensors["in.instance_idx"].long(), lifted, tensors["in.initial_depth"], tensors["in.target_rgb"])
     sizes = [int(metadata[name]) for name in ["hidden", "latent", "instances", "tracing_steps"]]
-    model = Model(*sizes, density=metadata["density"] == "True").to(device)
+    model = Model(*sizes, density=metadata["density"] == "True").to(lifted)
     model.load_state_dict({name.removeprefix("model."): tensors[name] for name in tensors if name.startswith("model.")})
+    return model, batch, cameras
+
+
+def golden_differences(tensors, metadata, keep):
+    """The worst difference of each quantity, relative to the largest expected value of its tensor."""
+    model, batch, cameras = golden(tensors, metadata)
     worst = {}
 
     def compare(quantity, actual, expected):
@@ -215,7 +223,8 @@ def check(files, device):
     for path in files:
         try:
             tensors, metadata = read_safetensors(path)
-            rows = {version: golden_differences(tensors, metadata, device, keep) for version, keep in VERSIONS.items()}
+            tensors = {name: tensor.to(device) for name, tensor in tensors.items()}
+            rows = {version: golden_differences(tensors, metadata, keep) for version, keep in VERSIONS.items()}
         except (OSError, AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             refuse(f"{path} cannot be checked: {type(error).__name__}: {error}")
         for version, row in rows.items():
@@ -223,6 +232,53 @@ def check(files, device):
             print(f"{path}, {version}: {', '.join(figures)}")
             passed &= all(value <= TOLERANCE for value in row.values())
     return 0 if passed else 1
+
+
+def moved(tensors, metadata, seed):
+    """How far trained parameters and refined poses end from their golden values when each weight begins up to 2^-24 of itself beside
+    its own, as rounding to float32 may put it; relative to the largest value of the tensor, and the worst of each."""
+    random = torch.Generator().manual_seed(seed)
+
+    def begin():
+        model, batch, cameras = golden(tensors, metadata)
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter *= 1 + 2**-24 * (2 * torch.rand(parameter.shape, generator=random, dtype=torch.float64) - 1)
+        return model, batch, cameras
+
+    def difference(actual, expected):
+        return ((actual.detach() - expected).abs().max() / expected.abs().max()).item()
+
+    model, batch, cameras = begin()
+    adam = torch.optim.Adam(model.parameters(), 5e-5)
+    for _ in tensors["train.losses"]:
+        training_step(model, cameras, adam, batch, keep=True)
+    trained = [name for name in tensors if name.startswith("train.final.")]
+    worst = [max(difference(model.get_parameter(name.removeprefix("train.final.")), tensors[name]) for name in trained)]
+    refined = 0.0
+    for rate in ["0.1", "0.01"]:
+        model, batch, _ = begin()
+        arguments, expected = frozen(model, batch, tensors[f"refine.lr{rate}.start"], float(rate)), tensors[f"refine.lr{rate}.poses"]
+        for poses in expected:
+            pose_step(*arguments, batch, keep=True)
+            refined = max(refined, ((arguments[2].detach() - poses).abs().max() / expected.abs().max()).item())
+    return [*worst, refined]
+
+
+def chance(files, runs):
+    for path in files:
+        try:
+            tensors, metadata = read_safetensors(path)
+            for dtype in [torch.float32, torch.float64]:
+                cast = {name: tensor.to(dtype) if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
+                rows = [moved(cast, metadata, seed) for seed in range(runs)]
+                for (quantity, limit), column in zip(MOVED, zip(*rows)):
+                    beyond = sum(value > limit for value in column)
+                    figures = f"median {statistics.median(column):.1e}, worst {max(column):.1e}, beyond {limit}: {beyond} of {runs}"
+                    print(f"{path}, {dtype}, {quantity}: {figures}", flush=True)
+        except (OSError, AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+            refuse(f"{path} cannot be checked: {type(error).__name__}: {error}")
+    return 0
 
 
 def median_seconds(work, runs, device):
@@ -294,6 +350,9 @@ def main():
     commands = parser.add_subparsers(dest="command", required=True)
     checking = commands.add_parser("check", help="compare with golden files")
     checking.add_argument("files", nargs="+", metavar="FILE")
+    by_chance = commands.add_parser("chance", help="train and refine from weights moved within their rounding")
+    by_chance.add_argument("files", nargs="+", metavar="FILE")
+    by_chance.add_argument("--runs", type=count, default=16, help="runs in each precision (default: 16)")
     timing = commands.add_parser("time", help="measure the steps")
     timing.add_argument("--width", type=int, choices=LATENT, required=True)
     timing.add_argument("--threads", type=count, help="threads on the CPU (default: PyTorch's choice)")
@@ -302,9 +361,11 @@ def main():
     timing.add_argument("--json", action="store_true")
     for command in [checking, timing]:
         command.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
-    for each in [parser, checking, timing]:
+    for each in [parser, checking, by_chance, timing]:
         each.error = refuse
     arguments = parser.parse_args()
+    if arguments.command == "chance":
+        return chance(arguments.files, arguments.runs)
     if arguments.device == "cuda" and not torch.cuda.is_available():
         refuse("--device cuda: this PyTorch finds no CUDA device")
     device = torch.device(arguments.device)

@@ -50,7 +50,7 @@ impl Peer {
         let (mut ran_on, mut all) = (Vec::new(), Vec::new());
         for &device in &self.devices {
             // A step of the paper's training takes half a minute on two cores.
-            let runs = if width > 64 && device == "cpu" { "1" } else { "3" };
+            let runs = if width > 64 && device == "cpu" { "1" } else { "5" };
             let mut command = Command::new(&self.python);
             command.arg(&script).args(["time", "--json", "--width", &width.to_string(), "--device", device, "--runs", runs]);
             let output = command.stderr(Stdio::inherit()).output()?;
