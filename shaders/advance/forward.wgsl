@@ -5,7 +5,6 @@
 
 struct Params {
     rows: u32,
-    features: u32,
     accumulate: u32,
 }
 

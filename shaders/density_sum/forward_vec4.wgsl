@@ -1,18 +1,26 @@
-// phi[r, j] (+)= density[r] feature[r, j].
-// One invocation computes four values of phi.
-// density [rows], feature [rows, features] → phi [rows, features]; features a multiple of 4.
-// ACCUMULATES phi where accumulate is 1, else OVERWRITES it.
+// density[r] = Σ_k head[k] hidden[r, k] + head[in], phi[r, j] (+)= density[r] feature[r, j].
+// One invocation computes one row, four values at a time.
+// hidden [rows, in], head [in + 1], feature [rows, features] → density [rows], phi [rows, features]; in and features multiples of 4.
+// OVERWRITES density; ACCUMULATES phi where accumulate is 1, else OVERWRITES it.
 
 struct Params {
     rows: u32,
+    in_features: u32,
     features: u32,
     accumulate: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> density: array<f32>;
-@group(0) @binding(2) var<storage, read> feature: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read_write> phi: array<vec4<f32>>;
+@group(0) @binding(1) var<storage, read> hidden: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> head: array<f32>;
+@group(0) @binding(3) var<storage, read> feature: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> density: array<f32>;
+@group(0) @binding(5) var<storage, read_write> phi: array<vec4<f32>>;
+
+// Four weights of the head.
+fn weights(k: u32) -> vec4<f32> {
+    return vec4(head[4u * k], head[4u * k + 1u], head[4u * k + 2u], head[4u * k + 3u]);
+}
 
 @compute @workgroup_size(64)
 fn main(
@@ -20,14 +28,23 @@ fn main(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_id) local: vec3<u32>,
 ) {
-    let index = flat_index(workgroup, workgroups, local);
-    let n = params.features / 4u;
-    if (index >= params.rows * n) {
+    let row = flat_index(workgroup, workgroups, local);
+    if (row >= params.rows) {
         return;
     }
-    var value = density[index / n] * feature[index];
-    if (params.accumulate == 1u) {
-        value += phi[index];
+    let m = params.in_features / 4u;
+    let n = params.features / 4u;
+    var sums = vec4(0.0);
+    for (var k = 0u; k < m; k++) {
+        sums += weights(k) * hidden[row * m + k];
     }
-    phi[index] = value;
+    let sigma = dot(sums, vec4(1.0)) + head[params.in_features];
+    density[row] = sigma;
+    for (var j = row * n; j < (row + 1u) * n; j++) {
+        var value = sigma * feature[j];
+        if (params.accumulate == 1u) {
+            value += phi[j];
+        }
+        phi[j] = value;
+    }
 }

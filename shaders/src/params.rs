@@ -158,13 +158,22 @@ params! {
         /// Size of the hidden state.
         hidden: u32,
     }
-    /// `advance/*`, `density_sum/*`.
-    PointParams {
+    /// `advance/*`.
+    AdvanceParams {
         /// Rows.
         rows: u32,
-        /// Values per row of the feature (`density_sum`).
-        features: u32,
         /// 1: add to the output, 0: overwrite it.
+        accumulate: u32,
+    }
+    /// `density_sum/*`.
+    DensitySumParams {
+        /// Rays.
+        rows: u32,
+        /// Values per row before the head of g.
+        in_features: u32,
+        /// Features of f.
+        features: u32,
+        /// 1: add to phi, 0: overwrite it.
         accumulate: u32,
     }
     /// `depth_loss/*`, `latent_loss/*`: a weighted sum over all values.

@@ -133,18 +133,19 @@ table! {
     LSTM_CELL_BACKWARD = "lstm_cell"/"backward", LstmParams, tile FLAT,
         (gates: f32, c_prev: f32, c: f32, d_h: f32, d_c: f32) -> (d_gates: f32, d_c_prev: f32);
     /// `x_next = x + direction · step`; `x, direction, x_next [rows,3]`, `step [rows]`. Extent: rows.
-    ADVANCE_FORWARD = "advance"/"forward", PointParams, tile FLAT,
+    ADVANCE_FORWARD = "advance"/"forward", AdvanceParams, tile FLAT,
         (x: f32, direction: f32, step: f32) -> (x_next: f32);
     /// `d_step = d_x_next · direction` (overwrites), `d_direction (+)= d_x_next step`. (`d_x = d_x_next`: the caller keeps the buffer.)
-    ADVANCE_BACKWARD = "advance"/"backward", PointParams, tile FLAT,
+    ADVANCE_BACKWARD = "advance"/"backward", AdvanceParams, tile FLAT,
         (direction: f32, step: f32, d_x_next: f32) -> (d_step: f32, d_direction: f32);
-    /// `phi[r] (+)= density[r] feature[r]`; `density [rows]`, `feature, phi [rows, features]`. Extent: rows · features.
-    DENSITY_SUM_FORWARD = "density_sum"/"forward", PointParams, tile FLAT,
-        (density: f32, feature: f32) -> (phi: f32),
-        or "forward_vec4" tile [256, 1, 1], when [FeaturesMultipleOf4];
-    /// `d_density[r] = ⟨d_phi[r], feature[r]⟩`, `d_feature[r] = density[r] d_phi[r]`; both overwrite. Extent: rows.
-    DENSITY_SUM_BACKWARD = "density_sum"/"backward", PointParams, tile FLAT,
-        (density: f32, feature: f32, d_phi: f32) -> (d_density: f32, d_feature: f32),
+    /// The last layer of g, and the sum: `density[r] = ⟨head, hidden[r]⟩ + bias`, `phi[r] (+)= density[r] feature[r]`;
+    /// `hidden [rows, in]`, `head [in + 1]`, `feature, phi [rows, features]`, `density [rows]`. Extent: rows.
+    DENSITY_SUM_FORWARD = "density_sum"/"forward", DensitySumParams, tile FLAT,
+        (hidden: f32, head: f32, feature: f32) -> (density: f32, phi: f32),
+        or "forward_vec4" tile FLAT, when [FeaturesMultipleOf4];
+    /// `d_density[r] = ⟨d_phi[r], feature[r]⟩`, `d_feature[r] = density[r] d_phi[r]`, `d_hidden[r] = d_density[r] head`; all overwrite. Extent: rows.
+    DENSITY_SUM_BACKWARD = "density_sum"/"backward", DensitySumParams, tile FLAT,
+        (density: f32, feature: f32, d_phi: f32, head: f32) -> (d_density: f32, d_feature: f32, d_hidden: f32),
         or "backward_vec4" tile FLAT, when [FeaturesMultipleOf4];
     /// `depth = R[:,2] · (x - t)`, z in the camera frame: `x [rows,3]` → `depth [rows]`. Extent: rows.
     DEPTH_FORWARD = "depth"/"forward", RowsParams, tile FLAT,

@@ -1,4 +1,5 @@
 use srn_plan::ops::density_sum;
+use srn_plan::ops::linear::{Layer, Sets};
 use srn_shaders::{DENSITY_SUM_BACKWARD, DENSITY_SUM_FORWARD};
 use srn_tests::{Case, Sketch};
 
@@ -6,27 +7,33 @@ use crate::KernelTest;
 
 pub static FORWARD: KernelTest = KernelTest {
     kernel: &DENSITY_SUM_FORWARD,
-    // Worst 5.5e-7 on llvmpipe.
+    // Worst 4.6e-7 on llvmpipe.
     tolerance: 3e-6,
-    cases: forward,
+    cases,
     faults: &[
-        ("forward", "index / params.features", "index % params.features"),
+        ("forward", "sigma = head[m]", "sigma = 0.0"),
+        ("forward", "hidden[row * m + k]", "hidden[row * n + k]"),
         ("forward", "accumulate == 1u", "accumulate == 0u"),
-        ("forward_vec4", "index / n", "index % n"),
+        ("forward_vec4", "+ head[params.in_features]", "+ head[0]"),
+        ("forward_vec4", "head[4u * k + 2u]", "head[4u * k + 1u]"),
+        ("forward_vec4", "dot(sums, vec4(1.0))", "sums.x"),
         ("forward_vec4", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 
 pub static BACKWARD: KernelTest = KernelTest {
     kernel: &DENSITY_SUM_BACKWARD,
-    // Worst 1.7e-7 on llvmpipe.
-    tolerance: 9e-7,
-    cases: backward,
+    // Worst 4.5e-7 on llvmpipe.
+    tolerance: 2e-6,
+    cases,
     faults: &[
         ("backward", "sigma * d_phi[j]", "sigma * feature[j]"),
         ("backward", "d_phi[j] * feature[j]", "d_phi[j] * d_phi[j]"),
+        ("backward", "total * head[k]", "sigma * head[k]"),
         ("backward_vec4", "sigma * d_phi[j]", "sigma * feature[j]"),
-        ("backward_vec4", "dot(total, vec4(1.0))", "total.x"),
+        ("backward_vec4", "dot(sums, vec4(1.0))", "sums.x"),
+        ("backward_vec4", "total * weights(k)", "sigma * weights(k)"),
+        ("backward_vec4", "head[4u * k + 3u]", "head[4u * k]"),
     ],
 };
 
@@ -40,33 +47,24 @@ fn backward_matches_reference() {
     BACKWARD.matches_reference();
 }
 
-const SIZES: [(u32, u32); 5] = [(1, 1), (7, 3), (129, 17), (33, 64), (70, 12)];
+/// Rows, values before the head, features.
+const SIZES: [(u32, u32, u32); 7] = [(1, 1, 1), (7, 3, 5), (129, 17, 8), (33, 64, 64), (70, 12, 36), (2, 36, 4), (301, 256, 100)];
 
-fn forward() -> Vec<Case> {
-    SIZES.iter().flat_map(|&(rows, features)| [false, true].map(|accumulate| forward_case(rows, features, accumulate))).collect()
+fn cases() -> Vec<Case> {
+    SIZES.iter().flat_map(|&size| [false, true].map(|accumulate| case(size, accumulate))).collect()
 }
 
-fn forward_case(rows: u32, features: u32, accumulate: bool) -> Case {
-    let mut s = Sketch::new(format!("{rows} rows of {features}, accumulate {accumulate}"));
-    let n = (rows * features) as usize;
-    let density = s.random("density", rows as usize);
-    let feature = s.random("feature", n);
-    let phi = s.output("phi", n, accumulate);
-    s.step(|b| density_sum::forward(b, rows, features, density, feature, phi, accumulate));
-    s.finish()
-}
-
-fn backward() -> Vec<Case> {
-    SIZES.map(|(rows, features)| backward_case(rows, features)).into()
-}
-
-fn backward_case(rows: u32, features: u32) -> Case {
-    let mut s = Sketch::new(format!("{rows} rows of {features}"));
-    let n = (rows * features) as usize;
-    let density = s.random("density", rows as usize);
+fn case((rows, in_features, features): (u32, u32, u32), accumulate: bool) -> Case {
+    let mut s = Sketch::new(format!("{rows} rows of {in_features} and {features}, accumulate {accumulate}"));
+    let (n, m, rays) = ((rows * features) as usize, (rows * in_features) as usize, rows as usize);
+    let weights = s.random("head", in_features as usize + 1);
+    let head = Layer { weights, in_features, out_features: 1, sets: Sets::Shared };
+    let hidden = s.random("hidden", m);
     let [feature, d_phi] = ["feature", "d_phi"].map(|name| s.random(name, n));
-    let d_density = s.scratch("d_density", rows as usize);
-    let d_feature = s.scratch("d_feature", n);
-    s.step(|b| density_sum::backward(b, rows, features, density, feature, d_phi, d_density, d_feature));
+    let [density, d_density] = ["density", "d_density"].map(|name| s.scratch(name, rays));
+    let phi = s.output("phi", n, accumulate);
+    let (d_feature, d_hidden) = (s.scratch("d_feature", n), s.scratch("d_hidden", m));
+    s.step(|b| density_sum::forward(b, rows, features, head, hidden, feature, density, phi, accumulate));
+    s.step(|b| density_sum::backward(b, rows, features, head, density, feature, d_phi, d_density, d_feature, d_hidden));
     s.finish()
 }

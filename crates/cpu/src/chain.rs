@@ -5,7 +5,9 @@ use std::cell::Cell;
 use std::ops::Range;
 
 use srn_plan::{BufferId, Step};
-use srn_shaders::{ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams, PointParams, RowsParams};
+use srn_shaders::{
+    AdvanceParams, DensitySumParams, ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams, RowsParams,
+};
 
 /// Rows of a block: what it reads and writes in a step should stay in a core's cache.
 const BLOCK_ROWS: usize = 256;
@@ -71,7 +73,7 @@ macro_rules! plain_rows {
     };
 }
 
-plain_rows!(LayerNormParams LstmParams PointParams);
+plain_rows!(AdvanceParams DensitySumParams LayerNormParams LstmParams);
 
 macro_rules! rows_of_groups {
     ($($params:ident)*) => {

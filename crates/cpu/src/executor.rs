@@ -2,7 +2,9 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 use srn_plan::{BufferId, Element, Executor, ExecutorError, Plan, StageId, Step};
-use srn_shaders::{ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams, PointParams, RowsParams};
+use srn_shaders::{
+    AdvanceParams, DensitySumParams, ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams, RowsParams,
+};
 
 use crate::chain::{Chain, Link, RowWise, Split};
 use crate::{Real, chain, ops};
@@ -363,11 +365,12 @@ references! {
         "lstm_cell/forward" => lstm_cell::forward(f f) -> (f_mut f_mut), |p: LstmParams| [4 * p.hidden, p.hidden, p.hidden, p.hidden];
         "lstm_cell/backward" => lstm_cell::backward(f f f f f) -> (f_mut f_mut),
             |p: LstmParams| [4 * p.hidden, p.hidden, p.hidden, p.hidden, p.hidden, 4 * p.hidden, p.hidden];
-        "advance/forward" => advance::forward(f f f) -> (f_mut), |_p: PointParams| [3, 3, 1, 3];
-        "advance/backward" => advance::backward(f f f) -> (f_mut f_mut), |_p: PointParams| [3, 1, 3, 1, 3];
-        "density_sum/forward" => density_sum::forward(f f) -> (f_mut), |p: PointParams| [1, p.features, p.features];
-        "density_sum/backward" => density_sum::backward(f f f) -> (f_mut f_mut),
-            |p: PointParams| [1, p.features, p.features, 1, p.features];
+        "advance/forward" => advance::forward(f f f) -> (f_mut), |_p: AdvanceParams| [3, 3, 1, 3];
+        "advance/backward" => advance::backward(f f f) -> (f_mut f_mut), |_p: AdvanceParams| [3, 1, 3, 1, 3];
+        "density_sum/forward" => density_sum::forward(f f f) -> (f_mut f_mut),
+            |p: DensitySumParams| [p.in_features, 0, p.features, 1, p.features];
+        "density_sum/backward" => density_sum::backward(f f f f) -> (f_mut f_mut f_mut),
+            |p: DensitySumParams| [1, p.features, p.features, 0, 1, p.features, p.in_features];
         "depth/forward" => depth::forward(f f) -> (f_mut), |_p: RowsParams| [0, 3, 1];
         "depth/backward" => depth::backward(f f) -> (f_mut), |_p: RowsParams| [0, 1, 3];
         "image_loss/backward" => image_loss::backward(f f f) -> (f_mut), |_p: ImageLossParams| [3, 4, 0, 3];

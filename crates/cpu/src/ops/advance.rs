@@ -1,11 +1,11 @@
 //! `x_next = x + direction · step`.
 
-use srn_shaders::PointParams;
+use srn_shaders::AdvanceParams;
 
 use crate::Real;
 
 /// One step along each ray.
-pub fn forward<T: Real>(p: PointParams, x: &[T], direction: &[T], step: &[T], x_next: &mut [T]) {
+pub fn forward<T: Real>(p: AdvanceParams, x: &[T], direction: &[T], step: &[T], x_next: &mut [T]) {
     for row in 0..p.rows as usize {
         for k in 3 * row..3 * row + 3 {
             x_next[k] = T::of(x[k].wide() + direction[k].wide() * step[row].wide());
@@ -14,7 +14,7 @@ pub fn forward<T: Real>(p: PointParams, x: &[T], direction: &[T], step: &[T], x_
 }
 
 /// `d_step = d_x_next · direction`, `d_direction (+)= d_x_next step`.
-pub fn backward<T: Real>(p: PointParams, direction: &[T], step: &[T], d_x_next: &[T], d_step: &mut [T], d_direction: &mut [T]) {
+pub fn backward<T: Real>(p: AdvanceParams, direction: &[T], step: &[T], d_x_next: &[T], d_step: &mut [T], d_direction: &mut [T]) {
     for row in 0..p.rows as usize {
         d_step[row] = T::of((3 * row..3 * row + 3).map(|k| d_x_next[k].wide() * direction[k].wide()).sum());
         for k in 3 * row..3 * row + 3 {

@@ -1,6 +1,6 @@
 //! One step along the ray: `x_{i+1} = x_i + d · step`.
 
-use srn_shaders::{ADVANCE_BACKWARD, ADVANCE_FORWARD, PointParams};
+use srn_shaders::{ADVANCE_BACKWARD, ADVANCE_FORWARD, AdvanceParams};
 
 use super::{output, overwrite, read, size};
 use crate::{BufferId, Builder, PlanError};
@@ -16,7 +16,7 @@ pub fn forward(
 ) -> Result<(), PlanError> {
     let n = size([rows, 3]);
     let args = [read(x, n), read(direction, n), read(step, size([rows])), overwrite(x_next, n)];
-    b.step(&ADVANCE_FORWARD, PointParams { rows, features: 3, accumulate: 0 }, &args, [rows, 1, 1], 0, 0)
+    b.step(&ADVANCE_FORWARD, AdvanceParams { rows, accumulate: 0 }, &args, [rows, 1, 1], 0, 0)
 }
 
 /// `d_x_next` → `d_step` (overwrites), `d_direction` (as `accumulate` says). `d_x` equals `d_x_next`: keep using that buffer.
@@ -38,5 +38,5 @@ pub fn backward(
         overwrite(d_step, size([rows])),
         output(d_direction, n, accumulate),
     ];
-    b.step(&ADVANCE_BACKWARD, PointParams { rows, features: 3, accumulate: accumulate.into() }, &args, [rows, 1, 1], 0, 0)
+    b.step(&ADVANCE_BACKWARD, AdvanceParams { rows, accumulate: accumulate.into() }, &args, [rows, 1, 1], 0, 0)
 }

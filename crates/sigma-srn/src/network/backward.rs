@@ -75,16 +75,24 @@ pub(crate) fn render(
         // The gradient of v_i: from the sum …
         let mut d_v = (i == last).then_some(scratch.d_phi);
         if let Some(density) = &network.density {
-            let g = saved.density[i].last().expect("g has layers").y;
-            density_sum::backward(b, n, features, g, v, scratch.d_phi, scratch.d_density, scratch.d_y)?;
+            let (head, layers) = density.split_last().expect("g has layers");
+            let (g, saved_layers) = saved.density[i].split_last().expect("g has layers");
+            let (d_g, d_hidden) = (scratch.d_density, scratch.d_hidden);
+            density_sum::backward(b, n, features, head.layer, g.y, v, scratch.d_phi, d_g, scratch.d_y, d_hidden)?;
             d_v = Some(scratch.d_y);
             // … and, before anything else touches d_x, from the marcher.
             if i < last {
                 marcher(b, network, saved, scratch, partial, rows, i, d_v, started)?;
             }
-            let inside = Inside { d_y: scratch.d_density_y, ..inside };
+            let inside = Inside { d_y: d_hidden, ..inside };
             let into = Into { buffer: d_x, accumulate: started.accumulate(d_x, 0) };
-            mlp(b, network, rows, density, saved.x[i], &saved.density[i], scratch.d_density, inside, Some(into), started)?;
+            if let Some(hidden) = saved_layers.last() {
+                weights(b, rows, head, hidden.y, d_g, partial, started)?;
+                mlp(b, network, rows, layers, saved.x[i], saved_layers, d_hidden, inside, Some(into), started)?;
+            } else {
+                // What the head reads are the points.
+                mlp(b, network, rows, density, saved.x[i], &saved.density[i], d_g, inside, Some(into), started)?;
+            }
         } else if i < last {
             marcher(b, network, saved, scratch, partial, rows, i, None, started)?;
             d_v = Some(scratch.d_y);

@@ -60,8 +60,10 @@ pub(crate) fn render(b: &mut Builder, network: &Network, saved: &Saved, tile: Ti
         let v = mlp(b, rows, &network.scene, saved.x[i], network.slots, &saved.scene[i])?;
         // phi = Σ g(x_i) f(x_i)
         if let Some(density) = &network.density {
-            let g = mlp(b, rows, density, saved.x[i], network.slots, &saved.density[i])?;
-            density_sum::forward(b, n, features, g, v, saved.phi, i > 0)?;
+            let (head, layers) = density.split_last().expect("g has layers");
+            let (g, saved_layers) = saved.density[i].split_last().expect("g has layers");
+            let hidden = mlp(b, rows, layers, saved.x[i], network.slots, saved_layers)?;
+            density_sum::forward(b, n, features, head.layer, hidden, v, g.y, saved.phi, i > 0)?;
         }
         if i == last {
             break;

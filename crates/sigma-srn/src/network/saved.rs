@@ -1,5 +1,6 @@
 //! Buffers of one tile: what the forward pass leaves for the backward pass, and scratch.
 
+use srn_plan::ops::point_layer;
 use srn_plan::{BufferId, Builder, PlanError};
 
 use super::{BlockBuffers, HyperBuffers, Network, Purpose};
@@ -140,10 +141,10 @@ impl Saved {
 #[derive(Debug)]
 pub(crate) struct Scratch {
     pub d_phi: BufferId,
-    /// Gradients inside an MLP: towards `y`, towards `z`, and towards `y` of the density net.
+    /// Gradients inside an MLP: towards `y`, towards `z`, and towards `y` of the density net's layers before its head.
     pub d_y: BufferId,
     pub d_z: BufferId,
-    pub d_density_y: BufferId,
+    pub d_hidden: BufferId,
     /// Gradient of the density `[rows, 1]`.
     pub d_density: BufferId,
     pub d_gates: BufferId,
@@ -181,7 +182,7 @@ impl Scratch {
             d_y,
             d_z: scratch("d z", f_and_h.max(widest(density)))?,
             // Plain SRN has neither; its gradients never reach these buffers.
-            d_density_y: if density.is_empty() { d_y } else { scratch("d y of g", widest(density))? },
+            d_hidden: if density.is_empty() { d_y } else { scratch("d y of g", widest(density).max(point_layer::COORDINATES))? },
             d_density: if density.is_empty() { d_y } else { scratch("d density", 1)? },
             d_gates: scratch("d gates", 4 * lstm)?,
             d_h: scratch("d h", lstm)?,
