@@ -1,7 +1,8 @@
 //! The reference in `f64` against central differences: every parameter of a training step, every number of a pose.
 
 use glam::{DMat3, DMat4, DVec3};
-use sigma_srn::{Engine, Method, Pose6, Train, Trainer, TrainingBatch};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use sigma_srn::{Engine, Method, Model, Pose6, Train, Trainer, TrainingBatch};
 
 use crate::{RAYS, batch, buffer, descent, methods, model, poses, trainer};
 
@@ -22,9 +23,8 @@ fn total(trainer: &mut Trainer, batch: &TrainingBatch) -> f64 {
     200.0 * mean("image loss") + mean("latent loss") + 10.0 * mean("depth loss")
 }
 
-fn parameters(density: bool) {
+fn parameters(model: Model) {
     const IMAGES: u32 = 3;
-    let model = model(density);
     let names: Vec<String> = model.parameters.iter().map(|parameter| parameter.tensors[0].0.clone()).collect();
     let mut trainer = trainer(&Engine::cpu_f64(), model, Train::Everything, IMAGES);
     let batch = batch(IMAGES);
@@ -64,12 +64,30 @@ fn parameters(density: bool) {
 
 #[test]
 fn of_every_parameter() {
-    parameters(true);
+    parameters(model(true));
 }
 
 #[test]
 fn of_every_parameter_of_plain_srn() {
-    parameters(false);
+    parameters(model(false));
+}
+
+/// The head of g then reads the points themselves.
+#[test]
+fn of_every_parameter_where_g_has_one_layer() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("model.safetensors");
+    model(true).save(&path).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    let metadata = SafeTensors::read_metadata(&bytes).unwrap().1.metadata().clone();
+    let file = SafeTensors::deserialize(&bytes).unwrap();
+    let numbers: Vec<u8> = [0.3f32, -0.2, 0.5, 0.1].iter().flat_map(|number| number.to_le_bytes()).collect();
+    let mut tensors: Vec<_> = file.tensors().into_iter().filter(|(name, _)| !name.starts_with("sigma.")).collect();
+    let tensor = |shape: &[usize], bytes| TensorView::new(Dtype::F32, shape.into(), bytes).unwrap();
+    tensors.push(("sigma.net.0.weight".into(), tensor(&[1, 3], &numbers[..12])));
+    tensors.push(("sigma.net.0.bias".into(), tensor(&[1], &numbers[12..])));
+    let bytes = safetensors::serialize(tensors, metadata).unwrap();
+    parameters(Model::from_bytes(&bytes, "", &path).unwrap());
 }
 
 #[test]
