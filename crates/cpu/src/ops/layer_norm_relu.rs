@@ -8,7 +8,8 @@ use super::chunk_of;
 use crate::Real;
 use crate::simd::{sum, vectorised};
 
-const EPSILON: f64 = 1e-5;
+/// Added to the variance.
+pub(super) const EPSILON: f64 = 1e-5;
 
 /// Saves mean and rstd of every row in `stats`.
 pub fn forward<T: Real>(p: LayerNormParams, x: &[T], affine: &[T], y: &mut [T], stats: &mut [T]) {
@@ -63,9 +64,15 @@ impl<R: Rows> WithSimd for InRegisters<R> {
             _ if !self.width.is_multiple_of(S::F32_LANES) => return false,
             1 => self.rows.run::<S, 1>(simd),
             2 => self.rows.run::<S, 2>(simd),
+            3 => self.rows.run::<S, 3>(simd),
             4 => self.rows.run::<S, 4>(simd),
+            6 => self.rows.run::<S, 6>(simd),
             8 => self.rows.run::<S, 8>(simd),
+            12 => self.rows.run::<S, 12>(simd),
             16 => self.rows.run::<S, 16>(simd),
+            // More than there are registers, where vectors are short; the rest is in the first cache.
+            32 => self.rows.run::<S, 32>(simd),
+            64 => self.rows.run::<S, 64>(simd),
             _ => return false,
         }
         true

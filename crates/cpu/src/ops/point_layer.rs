@@ -4,11 +4,11 @@
 use pulp::{Arch, Simd, WithSimd};
 use srn_shaders::PointLayerParams;
 
+use super::layer_norm_relu::EPSILON;
 use super::set_of;
 use crate::Real;
 use crate::simd::{load, store, sum, vectorised};
 
-const EPSILON: f64 = 1e-5;
 /// Rows that take turns, so that none waits for its own sums.
 const ROWS: usize = 4;
 /// Columns of `W` and the bias.
