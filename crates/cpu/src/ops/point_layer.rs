@@ -2,10 +2,10 @@
 //! numbers is cheaper than to read it.
 
 use pulp::{Arch, Simd, WithSimd};
-use srn_shaders::PointLayerParams;
+use srn_shaders::{LayerNormParams, LinearParams, PointLayerParams};
 
 use super::layer_norm_relu::EPSILON;
-use super::set_of;
+use super::{layer_norm_relu, linear, set_of};
 use crate::Real;
 use crate::simd::{load, store, sum, vectorised};
 
@@ -14,40 +14,19 @@ const ROWS: usize = 4;
 /// Columns of `W` and the bias.
 const COLUMNS: usize = 4;
 
-/// The linear map of one row, its mean and its rstd.
-fn normalisation<T: Real>(weights: &[T], x: &[T], z: &mut [T]) -> (T, T) {
-    let (weight, bias) = weights.split_at(3 * z.len());
-    for ((z, w), &bias) in z.iter_mut().zip(weight.chunks_exact(3)).zip(bias) {
-        *z = w[0] * x[0] + w[1] * x[1] + w[2] * x[2] + bias;
-    }
-    let count = T::of(z.len() as f64);
-    let mean = z.iter().copied().sum::<T>() / count;
-    let variance = z.iter().map(|&z| (z - mean) * (z - mean)).sum::<T>() / count;
-    (mean, T::one() / (variance + T::of(EPSILON)).sqrt())
-}
-
 /// `y = relu(gamma x̂ + beta)`, `x̂ = (z - mean) rstd`.
 pub fn forward<T: Real>(p: PointLayerParams, x: &[T], weights: &[T], slots: &[u32], affine: &[T], y: &mut [T]) {
     let (rows, width) = (p.rows_per_group as usize, p.features as usize);
-    let (gamma, beta) = affine[..2 * width].split_at(width);
-    let mut z = vec![T::zero(); width];
-    for (group, (x, y)) in x.chunks_exact(3 * rows).zip(y.chunks_exact_mut(rows * width)).enumerate().take(p.groups as usize) {
-        let weights = set_of(weights, 4 * width, p.weight_stride, slots, p.first_group as usize + group);
-        if let [Some(x), Some(weights), Some(affine)] = [x, weights, affine].map(T::singles)
-            && let Some(y) = T::singles_mut(&mut *y)
-        {
-            Arch::new().dispatch(Forward { layer: &Centred::of(weights, affine), x, y });
-            continue;
+    if let [Some(x), Some(weights), Some(affine)] = [x, weights, affine].map(T::singles)
+        && let Some(y) = T::singles_mut(&mut *y)
+    {
+        let groups = x.chunks_exact(3 * rows).zip(y.chunks_exact_mut(rows * width)).take(p.groups as usize);
+        for (group, (x, y)) in groups.enumerate() {
+            Arch::new().dispatch(Forward { layer: &Centred::of(p, weights, slots, group, affine), x, y });
         }
-        for (x, y) in x.chunks_exact(3).zip(y.chunks_exact_mut(width)) {
-            let (mean, rstd) = normalisation(weights, x, &mut z);
-            for (((y, &z), &gamma), &beta) in y.iter_mut().zip(&z).zip(gamma).zip(beta) {
-                let value = (z - mean) * rstd * gamma + beta;
-                // A NaN is no number to hide: it goes on.
-                *y = if value < T::zero() { T::zero() } else { value };
-            }
-        }
+        return;
     }
+    steps(p, x, weights, slots, affine, y);
 }
 
 /// `d_x (+)= Wᵀ d_z`, with `e = gamma · d_y` where `y > 0`: `d_z = rstd (e - mean(e) - x̂ mean(e x̂))`.
@@ -61,33 +40,47 @@ pub fn backward_input<T: Real>(
     d_x: &mut [T],
 ) {
     let (rows, width, accumulate) = (p.rows_per_group as usize, p.features as usize, p.accumulate == 1);
-    let (gamma, beta) = affine[..2 * width].split_at(width);
-    let count = T::of(width as f64);
-    let (mut z, mut e) = (vec![T::zero(); width], vec![T::zero(); width]);
-    let groups = x.chunks_exact(3 * rows).zip(d_y.chunks_exact(rows * width)).zip(d_x.chunks_exact_mut(3 * rows));
-    for (group, ((x, d_y), d_x)) in groups.enumerate().take(p.groups as usize) {
-        let weights = set_of(weights, 4 * width, p.weight_stride, slots, p.first_group as usize + group);
-        if let [Some(x), Some(weights), Some(affine), Some(d_y)] = [x, weights, affine, d_y].map(T::singles)
-            && let Some(d_x) = T::singles_mut(&mut *d_x)
-        {
-            Arch::new().dispatch(Backward { layer: &Centred::of(weights, affine), x, d_y, d_x, accumulate });
-            continue;
+    if let [Some(x), Some(weights), Some(affine), Some(d_y)] = [x, weights, affine, d_y].map(T::singles)
+        && let Some(d_x) = T::singles_mut(&mut *d_x)
+    {
+        let groups = x.chunks_exact(3 * rows).zip(d_y.chunks_exact(rows * width)).zip(d_x.chunks_exact_mut(3 * rows));
+        for (group, ((x, d_y), d_x)) in groups.enumerate().take(p.groups as usize) {
+            let layer = &Centred::of(p, weights, slots, group, affine);
+            Arch::new().dispatch(Backward { layer, x, d_y, d_x, accumulate });
         }
-        for ((x, d_y), d_x) in x.chunks_exact(3).zip(d_y.chunks_exact(width)).zip(d_x.chunks_exact_mut(3)) {
-            let (mean, rstd) = normalisation(weights, x, &mut z);
-            for ((((e, z), &d_y), &gamma), &beta) in e.iter_mut().zip(&mut z).zip(d_y).zip(gamma).zip(beta) {
-                *z = (*z - mean) * rstd;
-                *e = if *z * gamma + beta > T::zero() { gamma * d_y } else { T::zero() };
-            }
-            let mean_e = e.iter().copied().sum::<T>() / count;
-            let mean_ez = e.iter().zip(&z).map(|(&e, &z)| e * z).sum::<T>() / count;
-            for (i, d_x) in d_x.iter_mut().enumerate() {
-                let d_z = |e: T, z: T| rstd * (e - mean_e - z * mean_ez);
-                let terms = e.iter().zip(&z).zip(weights.chunks_exact(3)).map(|((&e, &z), w)| w[i] * d_z(e, z));
-                *d_x = terms.sum::<T>() + if accumulate { *d_x } else { T::zero() };
-            }
-        }
+        return;
     }
+    let [mut y, mut d_z] = [(); 2].map(|()| vec![T::zero(); d_y.len()]);
+    let (z, stats) = steps(p, x, weights, slots, affine, &mut y);
+    layer_norm_relu::backward_input(norm(p), &z, &stats, affine, d_y, &mut d_z);
+    linear::backward_input(LinearParams { accumulate: p.accumulate, ..map(p) }, &d_z, weights, slots, d_x);
+}
+
+/// The linear map alone.
+fn map(p: PointLayerParams) -> LinearParams {
+    LinearParams {
+        groups: p.groups,
+        rows_per_group: p.rows_per_group,
+        first_group: p.first_group,
+        in_features: 3,
+        out_features: p.features,
+        end_out: p.features,
+        weight_stride: p.weight_stride,
+        ..Default::default()
+    }
+}
+
+/// The norm alone.
+fn norm(p: PointLayerParams) -> LayerNormParams {
+    LayerNormParams { rows: p.groups * p.rows_per_group, features: p.features, ..Default::default() }
+}
+
+/// One step after the other, which is what this layer is; returns what they leave for the way back.
+fn steps<T: Real>(p: PointLayerParams, x: &[T], weights: &[T], slots: &[u32], affine: &[T], y: &mut [T]) -> (Vec<T>, Vec<T>) {
+    let (mut z, mut stats) = (vec![T::zero(); y.len()], vec![T::zero(); 2 * y.len() / p.features as usize]);
+    linear::forward(map(p), x, weights, slots, &mut z);
+    layer_norm_relu::forward(norm(p), &z, affine, y, &mut stats);
+    (z, stats)
 }
 
 vectorised! {
@@ -123,8 +116,9 @@ struct Centred<'a> {
 }
 
 impl<'a> Centred<'a> {
-    fn of(weights: &[f32], affine: &'a [f32]) -> Self {
-        let width = weights.len() / COLUMNS;
+    fn of(p: PointLayerParams, weights: &[f32], slots: &[u32], group: usize, affine: &'a [f32]) -> Self {
+        let width = p.features as usize;
+        let weights = set_of(weights, COLUMNS * width, p.weight_stride, slots, p.first_group as usize + group);
         let (weight, bias) = weights.split_at(3 * width);
         let rows = (0..3).flat_map(|i| weight.iter().skip(i).step_by(3));
         let mut columns: Vec<f64> = rows.chain(bias).map(|&value| value.into()).collect();
