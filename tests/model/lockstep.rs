@@ -47,8 +47,9 @@ fn a_training_step() {
         });
         let (subject, reference) = (subject.executor(), reference.executor());
         share_inputs(subject, reference);
-        step_by_step(subject, reference, "gradients");
-        step_by_step(subject, reference, "update");
+        for stage in ["hypernetwork", "render and back", "hypernetwork back", "update"] {
+            step_by_step(subject, reference, stage);
+        }
     }
 }
 

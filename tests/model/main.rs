@@ -11,6 +11,7 @@ mod behaviour;
 mod finite_differences;
 mod golden;
 mod lockstep;
+mod streamed;
 mod tiles;
 
 const SIZE: [u32; 2] = [9, 7];

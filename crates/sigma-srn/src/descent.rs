@@ -333,7 +333,7 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, method: Method, tile_rows
     let batch = Batch { images: hypotheses, rays: rays_per_image, slots };
     // Adam's matrices come from six numbers, those of BFGS are what it moves.
     let pose_is_input = matches!(method, Method::Bfgs { .. });
-    let network = Network::new(b, model, batch, Trainable::Nothing, pose_is_input)?;
+    let network = Network::new(b, model, batch, Trainable::Nothing, pose_is_input, &[])?;
     let cut = tiles(hypotheses, rays_per_image, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
     let saved = Saved::new(b, &network, Purpose::Pose, most)?;

@@ -101,12 +101,22 @@ impl Engine {
         }
     }
 
-    /// A builder with this engine's limits.
-    fn builder(&self) -> Builder {
-        Builder::new(match &self.kind {
+    /// Most bytes of one buffer, four to a value.
+    pub(crate) fn max_binding_bytes(&self) -> u64 {
+        match &self.kind {
             Kind::Gpu(gpu) => gpu.max_binding_bytes(),
             Kind::Cpu | Kind::CpuF64 => u64::MAX,
-        })
+        }
+    }
+
+    /// Bytes that a value of a plan takes.
+    pub(crate) fn value_bytes(&self) -> u64 {
+        if matches!(self.kind, Kind::CpuF64) { 8 } else { 4 }
+    }
+
+    /// A builder with this engine's limits.
+    fn builder(&self) -> Builder {
+        Builder::new(self.max_binding_bytes())
     }
 
     /// Builds a plan with the largest tiles that fit the budget and the device's limits, for a network of `features`
@@ -146,7 +156,7 @@ impl Engine {
     }
 
     fn bytes(&self, plan: &Plan) -> u64 {
-        plan.bytes() * if matches!(self.kind, Kind::CpuF64) { 2 } else { 1 }
+        plan.bytes() / 4 * self.value_bytes()
     }
 
     /// Makes a plan ready to run.

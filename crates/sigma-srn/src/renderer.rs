@@ -149,7 +149,7 @@ pub(crate) fn scene_weights(model: &Model, instance: u32) -> Result<Vec<Vec<f32>
 
 fn build(b: &mut Builder, model: &Model, views: u32, [width, height]: [u32; 2], tile_rows: u32) -> Result<Handles, PlanError> {
     let rays = width * height;
-    let network = Network::new(b, model, Batch { images: views, rays, slots: views }, Trainable::Nothing, true)?;
+    let network = Network::new(b, model, Batch { images: views, rays, slots: views }, Trainable::Nothing, true, &[])?;
     let cut = tiles(views, rays, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
     let saved = Saved::new(b, &network, Purpose::Render, most)?;

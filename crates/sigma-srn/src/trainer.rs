@@ -1,5 +1,6 @@
 //! Training (spec 3): `200 · mean((rgb − target)²) + mean(z²) + 10 · mean(min(depth, 0)²)`, Adam.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -9,6 +10,7 @@ use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, tiles};
 use crate::engine::{Engine, Runner};
 use crate::model::{Model, Tensors, read_tensors, write_tensors};
 use crate::network::backward::{self, HyperScratch};
+use crate::network::streamed::{self, Streamed};
 use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, SourceBuffers, Started, Trainable, forward};
 use crate::rays::wanted;
 use crate::{Error, Rays};
@@ -73,8 +75,12 @@ struct Handles {
     depth_loss: BufferId,
     /// Number of the parameter, first and second moment.
     moments: Vec<(usize, [BufferId; 2])>,
-    gradients: StageId,
+    /// Losses and gradients: the hypernetwork, all rays forward and back, the hypernetwork back. Streamed layers come in between.
+    before: StageId,
+    render: StageId,
+    after: StageId,
     update: StageId,
+    streamed: Option<Streamed>,
 }
 
 /// Trains a model, batch by batch.
@@ -87,6 +93,9 @@ pub struct Trainer {
 
 impl Trainer {
     /// A trainer for batches of `images` with `rays` rays each.
+    ///
+    /// Where the parameters with their gradients and moments would take more than half of the engine's memory budget, the large layers of
+    /// the hypernetwork stay on the host, and the device has a part of one at a time.
     pub fn new(engine: &Engine, model: Model, train: Train, images: u32, rays: u32) -> Result<Self, Error> {
         let batch = Batch { images, rays, slots: images };
         for (field, value) in [("batch", images), ("rays", rays)] {
@@ -96,8 +105,9 @@ impl Trainer {
         }
         model.hypernetwork()?;
         let features = model.layout.features();
-        let (plan, handles) =
-            engine.fit(images * rays, features, Purpose::Train, |b, tile_rows| build(b, &model, train, batch, tile_rows))?;
+        let most = most_resident(engine, &model, train);
+        let (plan, handles) = engine
+            .fit(images * rays, features, Purpose::Train, |b, tile_rows| build(b, &model, train, batch, tile_rows, most))?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, &model)?;
         let slots: Vec<u32> = (0..images).collect();
@@ -115,12 +125,21 @@ impl Trainer {
         self.runner.describe()
     }
 
+    /// Bytes of the parameters that stay on the host, without their moments; 0 where the memory budget holds all of them.
+    pub fn bytes_on_host(&self) -> u64 {
+        let parameters = self.model.parameters.iter().zip(&self.handles.network.parameters);
+        parameters.filter(|(_, buffer)| buffer.is_none()).map(|(parameter, _)| 4 * parameter.values.len() as u64).sum()
+    }
+
     /// One step of Adam at `learning_rate`; returns at once on a GPU.
     pub fn step(&mut self, batch: &TrainingBatch, learning_rate: f64) -> Result<(), Error> {
         self.gradients(batch)?;
         self.steps += 1;
         self.runner.write_f64(self.handles.schedule, &adam::schedule(learning_rate, self.steps))?;
         self.runner.run(self.handles.update)?;
+        if let Some(streamed) = &mut self.handles.streamed {
+            streamed.run_update(&mut *self.runner, &mut self.model)?;
+        }
         Ok(())
     }
 
@@ -140,7 +159,16 @@ impl Trainer {
         self.runner.write_f64(network.world_from_camera, batch.rays.world_from_camera.as_flattened())?;
         batch.rays.write(&mut *self.runner, network)?;
         self.runner.write(self.handles.target, &wanted(&batch.target_rgb, None))?;
-        self.runner.run(self.handles.gradients)?;
+        let Handles { streamed, before, render, after, .. } = &mut self.handles;
+        self.runner.run(*before)?;
+        if let Some(streamed) = streamed {
+            streamed.run_forward(&mut *self.runner, &self.model)?;
+        }
+        self.runner.run(*render)?;
+        if let Some(streamed) = streamed {
+            streamed.run_backward(&mut *self.runner, &self.model)?;
+        }
+        self.runner.run(*after)?;
         Ok(())
     }
 
@@ -161,9 +189,16 @@ impl Trainer {
     /// Gradients of the trained parameters after the last batch, by tensor name.
     pub fn read_gradients(&mut self) -> Result<Vec<(String, Vec<f32>)>, Error> {
         let mut gradients = Vec::new();
-        for (parameter, &d) in self.model.parameters.iter().zip(&self.handles.network.d_parameters) {
-            let Some(d) = d else { continue };
-            let values = self.runner.read(d)?;
+        for (number, parameter) in self.model.parameters.iter().enumerate() {
+            let streamed = match &self.handles.streamed {
+                Some(streamed) => streamed.read_gradient(&mut *self.runner, number, parameter.values.len())?,
+                None => None,
+            };
+            let values = match (self.handles.network.d_parameters[number], streamed) {
+                (Some(d), _) => self.runner.read(d)?,
+                (None, Some(values)) => values,
+                (None, None) => continue,
+            };
             let mut rest = values.as_slice();
             for (name, shape) in &parameter.tensors {
                 let (tensor, after) = rest.split_at(shape.iter().product());
@@ -186,8 +221,10 @@ impl Trainer {
 
     /// Reads the parameters back and returns the model. Fails where one is not finite, so that no such model is ever saved.
     pub fn model(&mut self) -> Result<&Model, Error> {
-        for (&buffer, parameter) in self.handles.network.parameters.iter().zip(&mut self.model.parameters) {
-            parameter.values = self.runner.read(buffer)?;
+        for (buffer, parameter) in self.handles.network.parameters.iter().zip(&mut self.model.parameters) {
+            if let Some(buffer) = *buffer {
+                parameter.values = self.runner.read(buffer)?;
+            }
             if !parameter.values.iter().all(|value| value.is_finite()) {
                 return Err(Error::Diverged { step: self.steps });
             }
@@ -199,13 +236,17 @@ impl Trainer {
     pub fn save_checkpoint(&mut self, path: &Path) -> Result<(), Error> {
         self.model()?;
         let mut moments = Vec::new();
-        for &(number, buffers) in &self.handles.moments {
-            for (kind, buffer) in ["m", "v"].into_iter().zip(buffers) {
-                moments.push((format!("adam.{kind}.{}", self.model.parameters[number].tensors[0].0), self.runner.read(buffer)?));
+        for &(number, [m, v]) in &self.handles.moments {
+            moments.push((number, [Cow::from(self.runner.read(m)?), Cow::from(self.runner.read(v)?)]));
+        }
+        let streamed = self.handles.streamed.iter().flat_map(Streamed::moments);
+        moments.extend(streamed.map(|(number, [m, v])| (number, [m.into(), v.into()])));
+        let mut tensors = self.model.tensors();
+        for (number, both) in &moments {
+            for (name, values) in moment_names(&self.model, *number).into_iter().zip(both) {
+                tensors.push((name, vec![values.len()], values));
             }
         }
-        let mut tensors = self.model.tensors();
-        tensors.extend(moments.iter().map(|(name, values)| (name.clone(), vec![values.len()], values.as_slice())));
         let mut metadata = self.model.metadata_text();
         metadata.insert("steps".into(), self.steps.to_string());
         write_tensors(path, &tensors, metadata)
@@ -221,12 +262,22 @@ impl Trainer {
         let (tensors, metadata): (Tensors, HashMap<String, String>) = read_tensors(path)?;
         let steps = metadata.get("steps").and_then(|steps| steps.parse().ok());
         let steps = steps.ok_or_else(|| Error::Format { path: path.into(), what: "no training state in it".into() })?;
+        let stored = |name: String, len: usize| match tensors.get(&name) {
+            Some((_, values)) if values.len() == len => Ok(values),
+            Some((shape, _)) => Err(Error::Tensor { name, expected: format!("[{len}]"), got: format!("{shape:?}") }),
+            None => Err(Error::MissingTensor { name }),
+        };
+        let stored = |number: usize| {
+            let [m, v] = moment_names(&model, number).map(|name| stored(name, model.parameters[number].values.len()));
+            Ok::<_, Error>([m?, v?])
+        };
         for &(number, buffers) in &self.handles.moments {
-            for (kind, buffer) in ["m", "v"].into_iter().zip(buffers) {
-                let name = format!("adam.{kind}.{}", model.parameters[number].tensors[0].0);
-                let (_, values) = tensors.get(&name).ok_or(Error::MissingTensor { name })?;
+            for (buffer, values) in buffers.into_iter().zip(stored(number)?) {
                 self.runner.write(buffer, values)?;
             }
+        }
+        for (number, home) in self.handles.streamed.iter_mut().flat_map(Streamed::moments_mut) {
+            *home = stored(number)?.map(Clone::clone);
         }
         self.handles.network.upload(&mut *self.runner, &model)?;
         self.model = model;
@@ -235,9 +286,34 @@ impl Trainer {
     }
 }
 
-fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: u32) -> Result<Handles, PlanError> {
+/// Names of a parameter's moments in a checkpoint.
+fn moment_names(model: &Model, number: usize) -> [String; 2] {
+    ["m", "v"].map(|kind| format!("adam.{kind}.{}", model.parameters[number].tensors[0].0))
+}
+
+/// Most values of a parameter of the hypernetwork that is on the device as a whole, and most of a part of one that is not.
+fn most_resident(engine: &Engine, model: &Model, train: Train) -> usize {
+    // Value, gradient and two moments.
+    let copies = if train == Train::Everything { 4 } else { 1 };
+    let values: usize = model.parameters.iter().map(|parameter| parameter.values.len()).sum();
+    let most = engine.max_binding_bytes() / 4;
+    let fits = copies * values as u64 * engine.value_bytes() <= engine.budget() / 2;
+    // The buffers of a part take a quarter of the budget at most.
+    if fits { most as usize } else { most.min(engine.budget() / (4 * copies * engine.value_bytes())) as usize }
+}
+
+fn build(
+    b: &mut Builder,
+    model: &Model,
+    train: Train,
+    batch: Batch,
+    tile_rows: u32,
+    most_resident: usize,
+) -> Result<Handles, PlanError> {
     let trainable = if train == Train::Codes { Trainable::Codes } else { Trainable::Everything };
-    let network = Network::new(b, model, batch, trainable, true)?;
+    let is_streamed = streamed::longer_than(model, most_resident);
+    let network = Network::new(b, model, batch, trainable, true, &is_streamed)?;
+    let mut streamed = Streamed::new(b, model, batch, &is_streamed, most_resident, train == Train::Everything)?;
     let (images, rays) = (batch.images, batch.rays);
     let rows = images * rays;
     let cut = tiles(images, rays, tile_rows);
@@ -251,7 +327,8 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
     let partial_len = cut.iter().map(|tile| backward::partial_len(&network, tile.rows)).max().unwrap_or(1);
     let sums =
         image_loss::partial_len(images, rays).max(depth_loss::partial_len(rows)).max(latent_loss::partial_len(codes_count));
-    let partial = b.scratch("partial sums", partial_len.max(sums))?;
+    let of_streamed = streamed.as_ref().map_or(0, |streamed| streamed.partial_len(&network));
+    let partial = b.scratch("partial sums", partial_len.max(sums).max(of_streamed))?;
     let target = b.input("target", 4 * rows as usize)?;
     let tile_target = b.scratch("tile target", 4 * most as usize)?;
     let d_rgb = b.scratch("tile d rgb", 3 * most as usize)?;
@@ -259,9 +336,14 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
     let (loss_images, loss_latent, loss_depth) =
         (b.scratch("image loss", images as usize)?, b.scratch("latent loss", 1)?, b.scratch("depth loss", 1)?);
 
-    let gradients = b.stage("gradients");
+    let before = b.stage("hypernetwork");
     let mut started = Started::default();
     forward::hypernetwork(b, &network, hyper, &hyper_saved)?;
+    if let Some(streamed) = &mut streamed {
+        streamed.forward(b, &network, &hyper_saved)?;
+    }
+
+    let render = b.stage("render and back");
     for &tile in &cut {
         forward::render(b, &network, &saved, tile)?;
         tile_ops::gather(b, tile, 4, target, tile_target)?;
@@ -271,6 +353,11 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
         depth::backward(b, tile.rows, scale, network.world_from_camera, saved.depth, scratch.d_origin)?;
         backward::render(b, &network, &saved, &scratch, partial, tile, d_rgb, true, &mut started)?;
     }
+    if let Some(streamed) = &mut streamed {
+        streamed.backward(b, &network, &hyper_scratch, &mut started)?;
+    }
+
+    let after = b.stage("hypernetwork back");
     backward::hypernetwork(b, &network, hyper, &hyper_saved, &hyper_scratch, partial, &mut started)?;
     let scale = (LATENT_WEIGHT / f64::from(codes_count)) as f32;
     latent_loss::backward(b, codes_count, scale, hyper_saved.z, hyper_scratch.d_z)?;
@@ -283,11 +370,14 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
     let schedule = b.input("schedule", 3)?;
     let mut moments = Vec::new();
     for (number, parameter) in model.parameters.iter().enumerate() {
-        let Some(d) = network.d_parameters[number] else { continue };
+        let (Some(d), Some(value)) = (network.d_parameters[number], network.parameters[number]) else { continue };
         let (name, len) = (&parameter.tensors[0].0, parameter.values.len());
         let [m, v] = [b.input(format!("m {name}"), len)?, b.input(format!("v {name}"), len)?];
-        adam::step(b, len as u32, d, schedule, network.parameters[number], m, v)?;
+        adam::step(b, len as u32, d, schedule, value, m, v)?;
         moments.push((number, [m, v]));
+    }
+    if let Some(streamed) = &mut streamed {
+        streamed.update(b, &network, &hyper_saved, partial, schedule)?;
     }
     Ok(Handles {
         network,
@@ -297,7 +387,10 @@ fn build(b: &mut Builder, model: &Model, train: Train, batch: Batch, tile_rows: 
         latent_loss: loss_latent,
         depth_loss: loss_depth,
         moments,
-        gradients,
+        before,
+        render,
+        after,
         update,
+        streamed,
     })
 }

@@ -103,6 +103,12 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     if is_resumed {
         eprintln!("going on after step {}", trainer.steps());
     }
+    if trainer.bytes_on_host() > 0 {
+        let (on_host, budget) = (trainer.bytes_on_host() >> 20, engine.budget() >> 20);
+        eprintln!(
+            "{on_host} MiB of weights stay on the host and come to the device in parts, for the memory budget of {budget} MiB"
+        );
+    }
     let stop = stop_on_signal()?;
     let mut meter = Meter::new(&settings, trainer.steps(), metrics.last().map_or(0.0, |record| record.seconds));
     let mut checkpointed = Instant::now();

@@ -138,10 +138,15 @@ pub fn backward_input(
     Ok(())
 }
 
+/// Whether [`backward_weight`] needs no partial sums: so few rows that one invocation sums over all, and the sets from the first on.
+fn is_direct(rows: Rows) -> bool {
+    rows.rows_per_group <= CHUNK_ROWS && rows.first_group == 0
+}
+
 /// Length of the partial sums of [`backward_weight`].
 pub fn partial_len(rows: Rows, layer: Layer) -> usize {
     let rows = layer.rows(rows);
-    size([rows.groups, rows.rows_per_group.div_ceil(CHUNK_ROWS), layer.parameters()])
+    if is_direct(rows) { 0 } else { size([rows.groups, rows.rows_per_group.div_ceil(CHUNK_ROWS), layer.parameters()]) }
 }
 
 /// Gradient of the weights, `d_weights [sets, out·in + out]`, by way of `partial`; with per-instance weights group `g`
@@ -158,8 +163,8 @@ pub fn backward_weight(
 ) -> Result<(), PlanError> {
     let rows = layer.rows(rows);
     let chunks = rows.rows_per_group.div_ceil(CHUNK_ROWS);
-    let direct = chunks == 1 && rows.first_group == 0;
-    let len = partial_len(rows, layer);
+    let direct = is_direct(rows);
+    let len = size([rows.groups, chunks, layer.parameters()]);
     let args = [
         read(x, size([rows.count(), layer.in_features])),
         read(d_y, size([rows.count(), layer.out_features])),

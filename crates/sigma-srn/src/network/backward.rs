@@ -211,10 +211,11 @@ pub(crate) fn hypernetwork(
 ) -> Result<(), PlanError> {
     let rows = Rows::plain(network.batch.slots);
     let inside = Inside { d_y: scratch.d_y, d_z: scratch.d_hidden, partial };
-    for ((blocks, saved_blocks), scene) in hyper.layers.iter().zip(&saved.mlps).zip(&network.scene) {
-        let Some(d_weights) = scene.d_weights else { continue };
+    for (number, (blocks, scene)) in hyper.layers.iter().zip(&network.scene).enumerate() {
+        // A streamed last layer has been gone through already.
+        let Some(d) = scratch.d_last_hidden[number].or(scene.d_weights).filter(|_| !blocks.is_empty()) else { continue };
         let into = Into { buffer: scratch.d_z, accumulate: started.accumulate(scratch.d_z, 0) };
-        mlp(b, network, rows, blocks, saved.z, saved_blocks, d_weights, inside, Some(into), started)?;
+        mlp(b, network, rows, blocks, saved.z, &saved.mlps[number], d, inside, Some(into), started)?;
     }
     Ok(())
 }
@@ -234,6 +235,8 @@ pub(crate) struct HyperScratch {
     pub d_hidden: BufferId,
     /// Gradient of the codes in the batch `[slots, latent]`.
     pub d_z: BufferId,
+    /// Of each MLP whose last layer is streamed, gradient of the values that this layer reads; `d_z` where those are the codes.
+    pub d_last_hidden: Vec<Option<BufferId>>,
 }
 
 impl HyperScratch {
@@ -241,6 +244,17 @@ impl HyperScratch {
         let hidden = hyper.layers.iter().flatten().filter(|block| block.affine.is_some()).map(|block| block.layer.out_features);
         let len = (network.batch.slots * hidden.max().unwrap_or(1)) as usize;
         let d_z = b.scratch("d z of slots", (network.batch.slots * hyper.latent) as usize)?;
-        Ok(HyperScratch { d_y: b.scratch("d y of hyper", len)?, d_hidden: b.scratch("d z of hyper", len)?, d_z })
+        let mut d_last_hidden = Vec::new();
+        for (number, blocks) in hyper.layers.iter().enumerate() {
+            d_last_hidden.push(match blocks.last() {
+                None => Some(d_z),
+                Some(block) if block.affine.is_some() => {
+                    let len = (network.batch.slots * block.layer.out_features) as usize;
+                    Some(b.scratch(format!("d y of hyper.{number}"), len)?)
+                }
+                Some(_) => None,
+            });
+        }
+        Ok(HyperScratch { d_y: b.scratch("d y of hyper", len)?, d_hidden: b.scratch("d z of hyper", len)?, d_z, d_last_hidden })
     }
 }

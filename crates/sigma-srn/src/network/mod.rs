@@ -4,6 +4,7 @@
 pub(crate) mod backward;
 pub(crate) mod forward;
 mod saved;
+pub(crate) mod streamed;
 
 use std::collections::HashSet;
 
@@ -65,7 +66,7 @@ pub(crate) struct HyperBuffers {
     /// Gradient of the codes, if wanted.
     pub d_codes: Option<BufferId>,
     pub latent: u32,
-    /// One MLP per layer of f.
+    /// One MLP per layer of f, without its last layer where that is streamed.
     pub layers: Vec<Vec<BlockBuffers>>,
 }
 
@@ -83,8 +84,8 @@ pub(crate) struct Network {
     pub batch: Batch,
     pub tracing_steps: u32,
     pub instances: u32,
-    /// One buffer per parameter of the model, in its order.
-    pub parameters: Vec<BufferId>,
+    /// One buffer per parameter of the model, in its order; `None` for those that are streamed.
+    pub parameters: Vec<Option<BufferId>>,
     /// Gradients of the parameters that are trained.
     pub d_parameters: Vec<Option<BufferId>>,
     /// Number of the instance behind each slot `[slots]`.
@@ -119,13 +120,15 @@ pub(crate) enum Trainable {
 }
 
 impl Network {
-    /// Adds the buffers. `world_from_camera` is a step's output when poses are estimated, else the caller's input.
+    /// Adds the buffers. `world_from_camera` is a step's output when poses are estimated, else the caller's input; the parameters numbered in
+    /// `streamed` get none.
     pub fn new(
         b: &mut Builder,
         model: &Model,
         batch: Batch,
         trainable: Trainable,
         pose_is_input: bool,
+        streamed: &[usize],
     ) -> Result<Self, PlanError> {
         let layout = &model.layout;
         let codes = match &layout.source {
@@ -135,8 +138,13 @@ impl Network {
         let mut parameters = Vec::new();
         let mut d_parameters = Vec::new();
         for (number, parameter) in model.parameters.iter().enumerate() {
+            if streamed.contains(&number) {
+                parameters.push(None);
+                d_parameters.push(None);
+                continue;
+            }
             let (name, len) = (&parameter.tensors[0].0, parameter.values.len());
-            parameters.push(b.input(name.clone(), len)?);
+            parameters.push(Some(b.input(name.clone(), len)?));
             let wanted = match trainable {
                 Trainable::Nothing => false,
                 Trainable::Codes => Some(number) == codes,
@@ -144,18 +152,20 @@ impl Network {
             };
             d_parameters.push(if wanted { Some(b.scratch(format!("d {name}"), len)?) } else { None });
         }
+        let resident = |number: usize| parameters[number].expect("what is streamed has been left out");
         let block = |block: &Block| BlockBuffers {
             layer: Layer {
-                weights: parameters[block.linear],
+                weights: resident(block.linear),
                 in_features: block.in_features,
                 out_features: block.out_features,
                 sets: Sets::Shared,
             },
-            affine: block.affine.map(|affine| parameters[affine]),
+            affine: block.affine.map(resident),
             d_weights: d_parameters[block.linear],
             d_affine: block.affine.and_then(|affine| d_parameters[affine]),
         };
-        let blocks = |list: &Vec<Block>| list.iter().map(block).collect::<Vec<_>>();
+        let blocks =
+            |list: &Vec<Block>| list.iter().filter(|block| parameters[block.linear].is_some()).map(block).collect::<Vec<_>>();
 
         let mut identity: Vec<(BufferId, u32)> = Vec::new();
         let mut scene = Vec::new();
@@ -195,12 +205,12 @@ impl Network {
             depth: b.scratch("depth", rows)?,
             source: match &layout.source {
                 Source::Hypernetwork(Hypernetwork { codes, latent, layers }) => SourceBuffers::Hypernetwork(HyperBuffers {
-                    codes: parameters[*codes],
+                    codes: resident(*codes),
                     d_codes: d_parameters[*codes],
                     latent: *latent,
                     layers: layers.iter().map(blocks).collect(),
                 }),
-                Source::Baked(stored) => SourceBuffers::Baked(stored.iter().map(|&number| parameters[number]).collect()),
+                Source::Baked(stored) => SourceBuffers::Baked(stored.iter().map(|&number| resident(number)).collect()),
             },
             scene,
             lstm_input: block(&layout.lstm_input),
@@ -226,8 +236,10 @@ impl Network {
 
     /// Writes the parameters and constants into an executor.
     pub fn upload(&self, executor: &mut dyn srn_plan::Executor, model: &Model) -> Result<(), srn_plan::ExecutorError> {
-        for (&buffer, parameter) in self.parameters.iter().zip(&model.parameters) {
-            executor.write(buffer, &parameter.values)?;
+        for (buffer, parameter) in self.parameters.iter().zip(&model.parameters) {
+            if let Some(buffer) = *buffer {
+                executor.write(buffer, &parameter.values)?;
+            }
         }
         for &(buffer, width) in &self.identity {
             executor.write(buffer, &[vec![1.0; width as usize], vec![0.0; width as usize]].concat())?;

@@ -233,4 +233,9 @@ impl HyperSaved {
         }
         Ok(HyperSaved { z, mlps })
     }
+
+    /// What the last layer of MLP `number` reads, where that layer is not one of `mlps`.
+    pub fn last_hidden(&self, number: usize) -> BufferId {
+        self.mlps[number].last().map_or(self.z, |layer| layer.y)
+    }
 }
