@@ -8,6 +8,7 @@ struct Params {
     features: u32,
     chunk_rows: u32,
     chunks: u32,
+    centred: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;

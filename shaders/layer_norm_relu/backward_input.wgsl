@@ -1,4 +1,4 @@
-// e = gamma d_y where y > 0, else 0; x̂ = (x - mean) rstd; d_x = rstd (e - mean(e) - x̂ mean(e x̂)), means over the features.
+// e = gamma d_y where y > 0, else 0; x̂ = (x - mean) rstd; d_x = rstd (e - mean(e) - x̂ mean(e x̂)), means over the features; of centred x without mean(e).
 // One invocation computes one row.
 // x, d_y [rows, features], stats [rows, 2] = (mean, rstd), affine [2, features] = (gamma, beta) → d_x [rows, features].
 // OVERWRITES d_x.
@@ -8,6 +8,7 @@ struct Params {
     features: u32,
     chunk_rows: u32,
     chunks: u32,
+    centred: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -45,7 +46,7 @@ fn main(
         sum += e;
         along += e * normalised;
     }
-    let mean_e = sum / f32(n);
+    let mean_e = select(0.0, sum / f32(n), params.centred == 0u);
     let mean_along = along / f32(n);
 
     for (var j = 0u; j < n; j++) {

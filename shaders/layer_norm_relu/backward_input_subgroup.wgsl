@@ -1,4 +1,4 @@
-// e = gamma d_y where y > 0, else 0; x̂ = (x - mean) rstd; d_x = rstd (e - mean(e) - x̂ mean(e x̂)), means over the features.
+// e = gamma d_y where y > 0, else 0; x̂ = (x - mean) rstd; d_x = rstd (e - mean(e) - x̂ mean(e x̂)), means over the features; of centred x without mean(e).
 // One invocation holds eight vectors of one or more rows in registers, so that they are read once; eight lanes add up what belongs to one. 32 rows in turn.
 // x, d_y [rows, features], stats [rows, 2] = (mean, rstd), affine [2, features] = (gamma, beta) → d_x [rows, features]; features a multiple of 4, at most 256.
 // OVERWRITES d_x.
@@ -8,6 +8,7 @@ struct Params {
     features: u32,
     chunk_rows: u32,
     chunks: u32,
+    centred: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -148,15 +149,18 @@ fn main(
         let e5 = d_normalised(c5, x5, gamma5, beta5, d_y[min(r5, last) * n + j5]);
         let e6 = d_normalised(c6, x6, gamma6, beta6, d_y[min(r6, last) * n + j6]);
         let e7 = d_normalised(c7, x7, gamma7, beta7, d_y[min(r7, last) * n + j7]);
-        let sums = total(Slots(
-            vec4(dot(e0, vec4(1.0)), dot(e1, vec4(1.0)), dot(e2, vec4(1.0)), dot(e3, vec4(1.0))),
-            vec4(dot(e4, vec4(1.0)), dot(e5, vec4(1.0)), dot(e6, vec4(1.0)), dot(e7, vec4(1.0))),
-        ), per_row);
+        var mean = Slots(vec4(0.0), vec4(0.0));
+        if (params.centred == 0u) {
+            let sums = total(Slots(
+                vec4(dot(e0, vec4(1.0)), dot(e1, vec4(1.0)), dot(e2, vec4(1.0)), dot(e3, vec4(1.0))),
+                vec4(dot(e4, vec4(1.0)), dot(e5, vec4(1.0)), dot(e6, vec4(1.0)), dot(e7, vec4(1.0))),
+            ), per_row);
+            mean = Slots(sums.a / f32(params.features), sums.b / f32(params.features));
+        }
         let alongs = total(Slots(
             vec4(dot(e0, x0), dot(e1, x1), dot(e2, x2), dot(e3, x3)),
             vec4(dot(e4, x4), dot(e5, x5), dot(e6, x6), dot(e7, x7)),
         ), per_row);
-        let mean = Slots(sums.a / f32(params.features), sums.b / f32(params.features));
         let along = Slots(alongs.a / f32(params.features), alongs.b / f32(params.features));
         put(r0, c0, rstd0 * (e0 - mean.a.x - x0 * along.a.x));
         put(r1, c1, rstd1 * (e1 - mean.a.y - x1 * along.a.y));

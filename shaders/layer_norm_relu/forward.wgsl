@@ -1,4 +1,4 @@
-// y = relu(gamma (x - mean) rstd + beta), rstd = 1 / √(var + 1e-5), var the mean of (x - mean)² over the features.
+// y = relu(gamma (x - mean) rstd + beta), rstd = 1 / √(var + 1e-5), var the mean of (x - mean)² over the features; of centred x mean = 0.
 // One invocation computes one row.
 // x [rows, features], affine [2, features] = (gamma, beta) → y [rows, features], stats [rows, 2] = (mean, rstd).
 // OVERWRITES y and stats.
@@ -8,6 +8,7 @@ struct Params {
     features: u32,
     chunk_rows: u32,
     chunks: u32,
+    centred: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -30,8 +31,10 @@ fn main(
     let at = row * n;
 
     var sum = 0.0;
-    for (var j = 0u; j < n; j++) {
-        sum += x[at + j];
+    if (params.centred == 0u) {
+        for (var j = 0u; j < n; j++) {
+            sum += x[at + j];
+        }
     }
     let mean = sum / f32(n);
 

@@ -1,4 +1,4 @@
-// y = relu(gamma (x - mean) rstd + beta), rstd = 1 / √(var + 1e-5), var the mean of (x - mean)² over the features.
+// y = relu(gamma (x - mean) rstd + beta), rstd = 1 / √(var + 1e-5), var the mean of (x - mean)² over the features; of centred x mean = 0.
 // One invocation holds eight vectors of one or more rows in registers, so that they are read once; eight lanes add up what belongs to one. 32 rows in turn.
 // x [rows, features], affine [2, features] = (gamma, beta) → y [rows, features], stats [rows, 2] = (mean, rstd); features a multiple of 4, at most 256.
 // OVERWRITES y and stats.
@@ -8,6 +8,7 @@ struct Params {
     features: u32,
     chunk_rows: u32,
     chunks: u32,
+    centred: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -122,11 +123,14 @@ fn main(
         let x5 = x[min(r5, last) * n + j5];
         let x6 = x[min(r6, last) * n + j6];
         let x7 = x[min(r7, last) * n + j7];
-        let sums = total(Slots(
-            vec4(sum(c0, x0), sum(c1, x1), sum(c2, x2), sum(c3, x3)),
-            vec4(sum(c4, x4), sum(c5, x5), sum(c6, x6), sum(c7, x7)),
-        ), per_row);
-        let mean = Slots(sums.a / f32(params.features), sums.b / f32(params.features));
+        var mean = Slots(vec4(0.0), vec4(0.0));
+        if (params.centred == 0u) {
+            let sums = total(Slots(
+                vec4(sum(c0, x0), sum(c1, x1), sum(c2, x2), sum(c3, x3)),
+                vec4(sum(c4, x4), sum(c5, x5), sum(c6, x6), sum(c7, x7)),
+            ), per_row);
+            mean = Slots(sums.a / f32(params.features), sums.b / f32(params.features));
+        }
         let d0 = x0 - mean.a.x;
         let d1 = x1 - mean.a.y;
         let d2 = x2 - mean.a.z;

@@ -150,6 +150,8 @@ params! {
         chunk_rows: u32,
         /// Partial sums (`backward_affine`): `ceil(rows / chunk_rows)`.
         chunks: u32,
+        /// 1: the rows have no mean, and none is looked for, neither of them nor, on the way back, of `e`.
+        centred: u32,
     }
     /// `lstm_cell/*`.
     LstmParams {

@@ -13,10 +13,13 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward", "+ 1e-5", "+ 1e-2"),
         ("forward", "affine[n + j]", "affine[j]"),
         ("forward", "1.0 / sqrt", "sqrt"),
+        ("forward", "params.centred == 0u", "true"),
         ("forward_vec4", "+ 1e-5", "+ 1e-2"),
         ("forward_vec4", "params.features / 4u;", "params.features / 8u;"),
         ("forward_vec4", "f32(params.features);", "f32(n);"),
+        ("forward_vec4", "params.centred == 0u", "params.centred == 1u"),
         ("forward_subgroup", "+ 1e-5", "+ 1e-2"),
+        ("forward_subgroup", "params.centred == 0u", "true"),
         ("forward_subgroup", "max(value, vec4(0.0))", "value"),
         ("forward_subgroup", "dot(value, vec4(1.0)), column", "dot(value, vec4(1.0)), 0u * column"),
         ("forward_subgroup", "4u, n > 16u", "2u, n > 16u"),
@@ -35,9 +38,12 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
         ("backward_input", "- mean_e", "+ mean_e"),
         ("backward_input", "along += e * normalised", "along += e"),
         ("backward_input", "> 0.0)", "< 0.0)"),
+        ("backward_input", "params.centred == 0u", "true"),
         ("backward_input_vec4", "- mean_e", "+ mean_e"),
         ("backward_input_vec4", "dot(along, vec4(1.0))", "dot(along, vec4(1.0, 1.0, 1.0, 0.0))"),
+        ("backward_input_vec4", "params.centred == 0u", "false"),
         ("backward_input_vec4", "params.features / 4u + j", "params.features / 2u + j"),
+        ("backward_input_subgroup", "params.centred == 0u", "true"),
         ("backward_input_subgroup", "mean.a.y - x1", "mean.a.x - x1"),
         ("backward_input_subgroup", "passes & vec4(column < params.features / 4u)", "passes"),
         ("backward_input_subgroup", "row += 8u / per_row", "row += 8u"),
@@ -89,12 +95,14 @@ fn cases() -> Vec<Case> {
         (9, 256, false),
         (5, 260, true),
     ];
-    odd.into_iter().chain(even).map(|(rows, features, accumulate)| case(rows, features, accumulate)).collect()
+    let sizes = odd.into_iter().chain(even);
+    sizes.enumerate().map(|(k, (rows, features, accumulate))| case(rows, features, accumulate, k % 3 == 1)).collect()
 }
 
 /// Forward and both ways back: these need the statistics.
-fn case(rows: u32, features: u32, accumulate: bool) -> Case {
-    let mut s = Sketch::new(format!("{rows} rows of {features}, accumulate {accumulate}"));
+fn case(rows: u32, features: u32, accumulate: bool, centred: bool) -> Case {
+    let kind = if centred { ", centred" } else { "" };
+    let mut s = Sketch::new(format!("{rows} rows of {features}, accumulate {accumulate}{kind}"));
     let (n, width) = ((rows * features) as usize, features as usize);
     let [x, d_y] = ["x", "d_y"].map(|name| s.random(name, n));
     let affine = s.random("affine", 2 * width);
@@ -102,7 +110,7 @@ fn case(rows: u32, features: u32, accumulate: bool) -> Case {
     let [y, d_x] = ["y", "d_x"].map(|name| s.scratch(name, n));
     let partial = s.scratch("partial", layer_norm_relu::partial_len(rows, features));
     let d_affine = s.output("d_affine", 2 * width, accumulate);
-    let saved = Saved { x, stats, affine };
+    let saved = Saved { x, stats, affine, centred };
     s.step(|b| layer_norm_relu::forward(b, rows, features, saved, y));
     s.step(|b| layer_norm_relu::backward_input(b, rows, features, saved, d_y, d_x));
     s.step(|b| layer_norm_relu::backward_affine(b, rows, features, saved, d_y, partial, d_affine, accumulate));

@@ -202,8 +202,8 @@ fn backward_weight_case(size: Size) -> Case {
     let (written, kept) = if size.sets == 0 { (1, 0) } else { (rows.groups as usize, rows.first_group as usize) };
     let accumulate = accumulate || kept > 0;
     let d_weights = s.output("d_weights", (kept + written) * parameters, accumulate);
-    let direct = kept == 0 && linear::partial_len(rows, layer) == written * parameters;
-    let partial = if direct { d_weights } else { s.scratch("partial", linear::partial_len(rows, layer)) };
+    let len = linear::partial_len(rows, layer);
+    let partial = if len == 0 { d_weights } else { s.scratch("partial", len) };
     s.step(|b| linear::backward_weight(b, rows, layer, x, d_y, partial, d_weights, accumulate));
     s.finish()
 }

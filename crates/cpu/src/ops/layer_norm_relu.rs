@@ -1,4 +1,4 @@
-//! `y = relu(gamma x̂ + beta)`, `x̂ = (x - mean) rstd`, `rstd = 1/√(var + 1e-5)`.
+//! `y = relu(gamma x̂ + beta)`, `x̂ = (x - mean) rstd`, `rstd = 1/√(var + 1e-5)`. Where `x` is centred, `mean` is 0, and `mean(e)` counts as 0.
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -17,20 +17,23 @@ pub fn forward<T: Real>(p: LayerNormParams, x: &[T], affine: &[T], y: &mut [T], 
     let (x, affine, y, stats) = (&x[..rows * width], &affine[..2 * width], &mut y[..rows * width], &mut stats[..2 * rows]);
     if let [Some(x), Some(affine)] = [x, affine].map(T::singles)
         && let [Some(y), Some(stats)] = [&mut *y, &mut *stats].map(T::singles_mut)
-        && Arch::new().dispatch(InRegisters { width, rows: Forward { x, affine, y, stats } })
+        && match p.centred {
+            1 => Arch::new().dispatch(InRegisters { width, rows: Forward::<true> { x, affine, y, stats } }),
+            _ => Arch::new().dispatch(InRegisters { width, rows: Forward::<false> { x, affine, y, stats } }),
+        }
     {
         return;
     }
-    forward_rows(x, affine, y, stats);
+    forward_rows(p.centred == 1, x, affine, y, stats);
 }
 
 vectorised! {
-    fn forward_rows<T: Real>(x: &[T], affine: &[T], y: &mut [T], stats: &mut [T]) {
+    fn forward_rows<T: Real>(centred: bool, x: &[T], affine: &[T], y: &mut [T], stats: &mut [T]) {
         let width = affine.len() / 2;
         let (gamma, beta) = affine.split_at(width);
         let count = T::of(width as f64);
         for ((x, y), stats) in x.chunks_exact(width).zip(y.chunks_exact_mut(width)).zip(stats.chunks_exact_mut(2)) {
-            let mean = sum(x, x, |x, _| x) / count;
+            let mean = if centred { T::zero() } else { sum(x, x, |x, _| x) / count };
             let variance = sum(x, x, |x, _| (x - mean) * (x - mean)) / count;
             let rstd = T::one() / (variance + T::of(EPSILON)).sqrt();
             for (((y, &x), &gamma), &beta) in y.iter_mut().zip(x).zip(gamma).zip(beta) {
@@ -84,14 +87,14 @@ fn rows_of<S: Simd, const V: usize>(values: &[f32]) -> &[[S::f32s; V]] {
 }
 
 /// [`forward`] with the processor's vectors, for rows of so many that they stay in registers.
-struct Forward<'a> {
+struct Forward<'a, const CENTRED: bool> {
     x: &'a [f32],
     affine: &'a [f32],
     y: &'a mut [f32],
     stats: &'a mut [f32],
 }
 
-impl Rows for Forward<'_> {
+impl<const CENTRED: bool> Rows for Forward<'_, CENTRED> {
     #[inline(always)]
     fn run<S: Simd, const V: usize>(self, simd: S) {
         let inverse = 1.0 / (V * S::F32_LANES) as f32;
@@ -100,19 +103,25 @@ impl Rows for Forward<'_> {
         let y = S::as_mut_simd_f32s(self.y).0.as_chunks_mut::<V>().0;
         for ((&x, y), stats) in rows_of::<S, V>(self.x).iter().zip(y).zip(self.stats.as_chunks_mut().0) {
             let (mut sum, mut squares, mut centred) = (zero, zero, x);
-            for v in 0..V {
-                sum = simd.add_f32s(sum, x[v]);
+            let mut mean = 0.0;
+            if !CENTRED {
+                for v in 0..V {
+                    sum = simd.add_f32s(sum, x[v]);
+                }
+                mean = simd.reduce_sum_f32s(sum) * inverse;
+                for v in 0..V {
+                    centred[v] = simd.sub_f32s(x[v], simd.splat_f32s(mean));
+                }
             }
-            let mean = simd.reduce_sum_f32s(sum) * inverse;
             for v in 0..V {
-                centred[v] = simd.sub_f32s(x[v], simd.splat_f32s(mean));
                 squares = simd.mul_add_e_f32s(centred[v], centred[v], squares);
             }
             let rstd = 1.0 / (simd.reduce_sum_f32s(squares) * inverse + EPSILON as f32).sqrt();
             for v in 0..V {
                 let normalised = simd.mul_f32s(centred[v], simd.splat_f32s(rstd));
                 let value = simd.mul_add_e_f32s(normalised, gamma[v], beta[v]);
-                y[v] = simd.select_f32s(simd.less_than_f32s(value, zero), zero, value);
+                // In this order a NaN goes on.
+                y[v] = simd.max_f32s(zero, value);
             }
             *stats = [mean, rstd];
         }
@@ -126,15 +135,18 @@ pub fn backward_input<T: Real>(p: LayerNormParams, x: &[T], stats: &[T], affine:
     let (stats, affine, d_x) = (&stats[..2 * rows], &affine[..2 * width], &mut d_x[..rows * width]);
     if let [Some(x), Some(stats), Some(affine), Some(d_y)] = [x, stats, affine, d_y].map(T::singles)
         && let Some(d_x) = T::singles_mut(&mut *d_x)
-        && Arch::new().dispatch(InRegisters { width, rows: Backward { x, stats, affine, d_y, d_x } })
+        && match p.centred {
+            1 => Arch::new().dispatch(InRegisters { width, rows: Backward::<true> { x, stats, affine, d_y, d_x } }),
+            _ => Arch::new().dispatch(InRegisters { width, rows: Backward::<false> { x, stats, affine, d_y, d_x } }),
+        }
     {
         return;
     }
-    backward_rows(x, stats, affine, d_y, d_x);
+    backward_rows(p.centred == 1, x, stats, affine, d_y, d_x);
 }
 
 vectorised! {
-    fn backward_rows<T: Real>(x: &[T], stats: &[T], affine: &[T], d_y: &[T], d_x: &mut [T]) {
+    fn backward_rows<T: Real>(centred: bool, x: &[T], stats: &[T], affine: &[T], d_y: &[T], d_x: &mut [T]) {
         let width = affine.len() / 2;
         let (gamma, beta) = affine.split_at(width);
         let count = T::of(width as f64);
@@ -145,7 +157,7 @@ vectorised! {
                 let live = normalised(x) * gamma + beta > T::zero();
                 *d_x = if live { gamma * d_y } else { T::zero() };
             }
-            let mean_e = sum(d_x, d_x, |e, _| e) / count;
+            let mean_e = if centred { T::zero() } else { sum(d_x, d_x, |e, _| e) / count };
             let mean_ex = sum(d_x, x, |e, x| e * normalised(x)) / count;
             for (d_x, &x) in d_x.iter_mut().zip(x) {
                 *d_x = stats[1] * (*d_x - mean_e - normalised(x) * mean_ex);
@@ -155,7 +167,7 @@ vectorised! {
 }
 
 /// [`backward_input`] with the processor's vectors, as [`Forward`].
-struct Backward<'a> {
+struct Backward<'a, const CENTRED: bool> {
     x: &'a [f32],
     stats: &'a [f32],
     affine: &'a [f32],
@@ -163,7 +175,7 @@ struct Backward<'a> {
     d_x: &'a mut [f32],
 }
 
-impl Rows for Backward<'_> {
+impl<const CENTRED: bool> Rows for Backward<'_, CENTRED> {
     #[inline(always)]
     fn run<S: Simd, const V: usize>(self, simd: S) {
         let inverse = 1.0 / (V * S::F32_LANES) as f32;
@@ -175,16 +187,19 @@ impl Rows for Backward<'_> {
             let (means, rstds) = (simd.splat_f32s(mean), simd.splat_f32s(rstd));
             let (mut sum, mut along, mut normalised, mut e) = (zero, zero, x, x);
             for v in 0..V {
-                normalised[v] = simd.mul_f32s(simd.sub_f32s(x[v], means), rstds);
+                normalised[v] = simd.mul_f32s(if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) }, rstds);
                 let live = simd.greater_than_f32s(simd.mul_add_e_f32s(normalised[v], gamma[v], beta[v]), zero);
                 e[v] = simd.select_f32s(live, simd.mul_f32s(gamma[v], d_y[v]), zero);
-                sum = simd.add_f32s(sum, e[v]);
+                if !CENTRED {
+                    sum = simd.add_f32s(sum, e[v]);
+                }
                 along = simd.mul_add_e_f32s(e[v], normalised[v], along);
             }
-            let mean_e = simd.splat_f32s(simd.reduce_sum_f32s(sum) * inverse);
+            let mean_e = if CENTRED { zero } else { simd.splat_f32s(simd.reduce_sum_f32s(sum) * inverse) };
             let mean_along = simd.splat_f32s(simd.reduce_sum_f32s(along) * inverse);
             for v in 0..V {
-                let d = simd.negate_mul_add_e_f32s(normalised[v], mean_along, simd.sub_f32s(e[v], mean_e));
+                let e = if CENTRED { e[v] } else { simd.sub_f32s(e[v], mean_e) };
+                let d = simd.negate_mul_add_e_f32s(normalised[v], mean_along, e);
                 d_x[v] = simd.mul_f32s(rstds, d);
             }
         }

@@ -17,6 +17,9 @@ pub struct Saved {
     pub stats: BufferId,
     /// `[2, features]`: gamma, beta.
     pub affine: BufferId,
+    /// The rows of `x` have no mean, since the weights of the linear map before have none over its outputs. Then none is looked for, and on
+    /// the way back what is the same for all features of a row is left in `d_x`: that map takes it to nothing.
+    pub centred: bool,
 }
 
 /// `x [rows, features]` → `y [rows, features]`; overwrites `saved.stats`.
@@ -24,7 +27,7 @@ pub fn forward(b: &mut Builder, rows: u32, features: u32, saved: Saved, y: Buffe
     let n = size([rows, features]);
     let args =
         [read(saved.x, n), read(saved.affine, size([2, features])), overwrite(y, n), overwrite(saved.stats, size([rows, 2]))];
-    b.step(&LAYER_NORM_RELU_FORWARD, params(rows, features, 0, 0), &args, [rows, 1, 1], 3 * u64::from(features), 0)
+    b.step(&LAYER_NORM_RELU_FORWARD, params(rows, features, saved), &args, [rows, 1, 1], 3 * u64::from(features), 0)
 }
 
 /// `d_y` → `d_x`, both `[rows, features]`; overwrites.
@@ -44,7 +47,7 @@ pub fn backward_input(
         read(d_y, n),
         overwrite(d_x, n),
     ];
-    b.step(&LAYER_NORM_RELU_BACKWARD_INPUT, params(rows, features, 0, 0), &args, [rows, 1, 1], 2 * u64::from(features), 0)
+    b.step(&LAYER_NORM_RELU_BACKWARD_INPUT, params(rows, features, saved), &args, [rows, 1, 1], 2 * u64::from(features), 0)
 }
 
 /// Length of the partial sums of [`backward_affine`].
@@ -72,11 +75,11 @@ pub fn backward_affine(
         read(d_y, n),
         overwrite(partial, partial_len(rows, features)),
     ];
-    let params = params(rows, features, CHUNK_ROWS, chunks);
+    let params = LayerNormParams { chunk_rows: CHUNK_ROWS, chunks, ..params(rows, features, saved) };
     b.step(&LAYER_NORM_RELU_BACKWARD_AFFINE, params, &args, [features, chunks, 1], CHUNK_ROWS.into(), 0)?;
     sum::forward(b, sum::Groups::ONE, chunks, 2 * features, partial, d_affine, accumulate)
 }
 
-fn params(rows: u32, features: u32, chunk_rows: u32, chunks: u32) -> LayerNormParams {
-    LayerNormParams { rows, features, chunk_rows, chunks }
+fn params(rows: u32, features: u32, saved: Saved) -> LayerNormParams {
+    LayerNormParams { rows, features, centred: saved.centred.into(), ..Default::default() }
 }

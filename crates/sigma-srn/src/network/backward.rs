@@ -165,7 +165,7 @@ fn mlp(
             continue;
         }
         if let Some(affine) = block.affine {
-            let norm = NormSaved { x: block_saved.z, stats: block_saved.stats, affine };
+            let norm = NormSaved { x: block_saved.z, stats: block_saved.stats, affine, centred: block.centred };
             if let Some(d_affine) = block.d_affine {
                 let accumulate = started.accumulate(d_affine, 0);
                 layer_norm_relu::backward_affine(b, rows.count(), features, norm, d, inside.partial, d_affine, accumulate)?;

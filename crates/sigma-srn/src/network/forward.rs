@@ -98,7 +98,7 @@ fn mlp(
         } else {
             linear::forward(b, rows, block.layer, x, slots, saved.z, false)?;
             if let Some(affine) = block.affine {
-                let norm = NormSaved { x: saved.z, stats: saved.stats, affine };
+                let norm = NormSaved { x: saved.z, stats: saved.stats, affine, centred: block.centred };
                 layer_norm_relu::forward(b, rows.count(), block.layer.out_features, norm, saved.y)?;
             }
         }

@@ -2,6 +2,7 @@
 //! marcher, density net g, density-weighted sum, pixel generator h. [`forward`] and [`backward`] mirror each other.
 
 pub(crate) mod backward;
+mod centred;
 pub(crate) mod forward;
 mod saved;
 pub(crate) mod streamed;
@@ -48,6 +49,8 @@ pub(crate) struct BlockBuffers {
     pub d_weights: Option<BufferId>,
     /// Gradient of gamma and beta, if wanted.
     pub d_affine: Option<BufferId>,
+    /// Before a norm: its weights have no mean over its outputs.
+    pub centred: bool,
 }
 
 impl BlockBuffers {
@@ -82,6 +85,7 @@ pub(crate) enum SourceBuffers {
 #[derive(Debug)]
 pub(crate) struct Network {
     pub batch: Batch,
+    trainable: Trainable,
     pub tracing_steps: u32,
     pub instances: u32,
     /// One buffer per parameter of the model, in its order; `None` for those that are streamed.
@@ -163,6 +167,7 @@ impl Network {
             affine: block.affine.map(resident),
             d_weights: d_parameters[block.linear],
             d_affine: block.affine.and_then(|affine| d_parameters[affine]),
+            centred: trainable == Trainable::Nothing,
         };
         let blocks =
             |list: &Vec<Block>| list.iter().filter(|block| parameters[block.linear].is_some()).map(block).collect::<Vec<_>>();
@@ -182,6 +187,7 @@ impl Network {
                 affine: identity.iter().find(|known| known.1 == out_features).map(|known| known.0),
                 d_weights,
                 d_affine: None,
+                centred: trainable == Trainable::Nothing,
             });
         }
 
@@ -189,6 +195,7 @@ impl Network {
         let rows = images * batch.rays as usize;
         Ok(Network {
             batch,
+            trainable,
             tracing_steps: layout.tracing_steps,
             instances: layout.instances,
             index: b.input_u32("instance of slot", batch.slots as usize)?,
@@ -234,11 +241,14 @@ impl Network {
         self.lstm_hidden.layer.in_features
     }
 
-    /// Writes the parameters and constants into an executor.
+    /// Writes the parameters and constants into an executor; where nothing is trained, without the means that a norm takes off anyway.
     pub fn upload(&self, executor: &mut dyn srn_plan::Executor, model: &Model) -> Result<(), srn_plan::ExecutorError> {
-        for (buffer, parameter) in self.parameters.iter().zip(&model.parameters) {
-            if let Some(buffer) = *buffer {
-                executor.write(buffer, &parameter.values)?;
+        for (number, (buffer, parameter)) in self.parameters.iter().zip(&model.parameters).enumerate() {
+            let Some(buffer) = *buffer else { continue };
+            let is_frozen = self.trainable == Trainable::Nothing;
+            match is_frozen.then(|| centred::centred(&model.layout, number, parameter)).flatten() {
+                Some(values) => executor.write_f64(buffer, &values)?,
+                None => executor.write(buffer, &parameter.values)?,
             }
         }
         for &(buffer, width) in &self.identity {
