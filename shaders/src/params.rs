@@ -164,7 +164,9 @@ params! {
     AdvanceParams {
         /// Rows.
         rows: u32,
-        /// 1: add to the output, 0: overwrite it.
+        /// Size of the hidden state.
+        hidden: u32,
+        /// 1: add to the outputs, 0: overwrite them.
         accumulate: u32,
     }
     /// `density_sum/*`.

@@ -132,12 +132,14 @@ table! {
     /// Clamps `d_h` to ±10, then back to the gates (before activation) and to `c_prev`; `d_c` arrives from the next step.
     LSTM_CELL_BACKWARD = "lstm_cell"/"backward", LstmParams, tile FLAT,
         (gates: f32, c_prev: f32, c: f32, d_h: f32, d_c: f32) -> (d_gates: f32, d_c_prev: f32);
-    /// `x_next = x + direction · step`; `x, direction, x_next [rows,3]`, `step [rows]`. Extent: rows.
+    /// `step = ⟨head, h⟩ + bias`, `x_next = x + direction · step`; `x, direction, x_next [rows,3]`, `h [rows, hidden]`, `head [hidden + 1]`,
+    /// `step [rows]`. Extent: rows.
     ADVANCE_FORWARD = "advance"/"forward", AdvanceParams, tile FLAT,
-        (x: f32, direction: f32, step: f32) -> (x_next: f32);
-    /// `d_step = d_x_next · direction` (overwrites), `d_direction (+)= d_x_next step`. (`d_x = d_x_next`: the caller keeps the buffer.)
+        (x: f32, direction: f32, h: f32, head: f32) -> (step: f32, x_next: f32);
+    /// `d_step = d_x_next · direction` (overwrites), `d_direction (+)= d_x_next step`, `d_h (+)= d_step head`. (`d_x = d_x_next`: the caller keeps
+    /// the buffer.)
     ADVANCE_BACKWARD = "advance"/"backward", AdvanceParams, tile FLAT,
-        (direction: f32, step: f32, d_x_next: f32) -> (d_step: f32, d_direction: f32);
+        (direction: f32, step: f32, d_x_next: f32, head: f32) -> (d_step: f32, d_direction: f32, d_h: f32);
     /// The last layer of g, and the sum: `density[r] = ⟨head, hidden[r]⟩ + bias`, `phi[r] (+)= density[r] feature[r]`;
     /// `hidden [rows, in]`, `head [in + 1]`, `feature, phi [rows, features]`, `density [rows]`. Extent: rows.
     DENSITY_SUM_FORWARD = "density_sum"/"forward", DensitySumParams, tile FLAT,

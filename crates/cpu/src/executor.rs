@@ -365,8 +365,8 @@ references! {
         "lstm_cell/forward" => lstm_cell::forward(f f) -> (f_mut f_mut), |p: LstmParams| [4 * p.hidden, p.hidden, p.hidden, p.hidden];
         "lstm_cell/backward" => lstm_cell::backward(f f f f f) -> (f_mut f_mut),
             |p: LstmParams| [4 * p.hidden, p.hidden, p.hidden, p.hidden, p.hidden, 4 * p.hidden, p.hidden];
-        "advance/forward" => advance::forward(f f f) -> (f_mut), |_p: AdvanceParams| [3, 3, 1, 3];
-        "advance/backward" => advance::backward(f f f) -> (f_mut f_mut), |_p: AdvanceParams| [3, 1, 3, 1, 3];
+        "advance/forward" => advance::forward(f f f f) -> (f_mut f_mut), |p: AdvanceParams| [3, 3, p.hidden, 0, 1, 3];
+        "advance/backward" => advance::backward(f f f f) -> (f_mut f_mut f_mut), |p: AdvanceParams| [3, 1, 3, 0, 1, 3, p.hidden];
         "density_sum/forward" => density_sum::forward(f f f) -> (f_mut f_mut),
             |p: DensitySumParams| [p.in_features, 0, p.features, 1, p.features];
         "density_sum/backward" => density_sum::backward(f f f f) -> (f_mut f_mut f_mut),

@@ -62,7 +62,6 @@ pub(crate) fn render(
     let d_x = scratch.d_origin;
     let inside = Inside { d_y: scratch.d_y, d_z: scratch.d_z, partial };
     started.restart(d_x, 0);
-    started.restart(scratch.d_direction, 0);
     if d_end {
         started.accumulate(d_x, 0);
     }
@@ -122,10 +121,10 @@ fn marcher(
     let steps = network.tracing_steps as usize;
     let v = saved.scene[i].last().expect("f has layers").y;
     let first = i + 1 == steps;
-    let accumulate = started.accumulate(scratch.d_direction, 0);
-    advance::backward(b, n, saved.direction, saved.step[i], scratch.d_origin, scratch.d_step, scratch.d_direction, accumulate)?;
+    let (head, direction, step) = (network.step_head.layer, saved.direction, saved.step[i]);
+    let (d_step, d_direction, d_h) = (scratch.d_step, scratch.d_direction, scratch.d_h);
+    advance::backward(b, n, head, direction, step, scratch.d_origin, d_step, d_direction, d_h, !first)?;
     weights(b, rows, &network.step_head, saved.h[i + 1], scratch.d_step, partial, started)?;
-    linear::backward_input(b, rows, network.step_head.layer, scratch.d_step, network.slots, scratch.d_h, !first)?;
 
     let d_c = if first { scratch.zero_state } else { scratch.d_c[(i + 1) % 2] };
     let d_c_prev = scratch.d_c[i % 2];

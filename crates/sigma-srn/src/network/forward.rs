@@ -72,8 +72,8 @@ pub(crate) fn render(b: &mut Builder, network: &Network, saved: &Saved, tile: Ti
         linear::forward(b, rows, network.lstm_input.layer, v, network.slots, saved.gates[i], false)?;
         linear::forward(b, rows, network.lstm_hidden.layer, saved.h[i], network.slots, saved.gates[i], true)?;
         lstm_cell::forward(b, n, lstm, saved.gates[i], saved.c[i], saved.h[i + 1], saved.c[i + 1])?;
-        linear::forward(b, rows, network.step_head.layer, saved.h[i + 1], network.slots, saved.step[i], false)?;
-        advance::forward(b, n, saved.x[i], saved.direction, saved.step[i], saved.x[i + 1])?;
+        let head = network.step_head.layer;
+        advance::forward(b, n, head, saved.x[i], saved.direction, saved.h[i + 1], saved.step[i], saved.x[i + 1])?;
     }
     // rgb = h(phi); depth = z of x_M
     let rgb = mlp(b, rows, &network.pixel_generator, saved.phi, network.slots, &saved.pixel_generator)?;
