@@ -59,7 +59,7 @@ fn sum(column: u32, value: vec4<f32>) -> f32 {
     return select(0.0, dot(value, vec4(1.0)), column < params.features / 4u);
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
@@ -71,7 +71,7 @@ fn main(
     let n = params.features / 4u;
     let per_row = select(select(select(1u, 2u, n > 8u), 4u, n > 16u), 8u, n > 32u);
     let team = (subgroup * subgroup_size + lane) / 8u;
-    let first = 32u * (8u * (workgroup.y * workgroups.x + workgroup.x) + team);
+    let first = 32u * (4u * (workgroup.y * workgroups.x + workgroup.x) + team);
     // Columns of the vectors; the last one stands in for those beyond the row, which count as zero and are not stored.
     let c0 = lane % 8u;
     let c1 = lane % 8u + 8u * (1u % per_row);

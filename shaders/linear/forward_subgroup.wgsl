@@ -83,18 +83,18 @@ fn store(group: u32, row: u32, out: u32, sum: Eight, bias: vec4<f32>) {
     put(group, row + 7u, out, sum.r7 + bias);
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(subgroup_id) subgroup: u32,
     @builtin(subgroup_size) subgroup_size: u32,
     @builtin(subgroup_invocation_id) lane: u32,
 ) {
-    // Eight lanes compute 32 rows × 64 output features; a workgroup has eight such teams, whatever the size of a subgroup.
+    // Eight lanes compute 32 rows × 64 output features; a workgroup has four such teams, whatever the size of a subgroup.
     let team = (subgroup * subgroup_size + lane) / 8u;
     let member = lane % 8u;
     let first = lane - member;
-    let row = 256u * workgroup.x + 32u * team;
+    let row = 128u * workgroup.x + 32u * team;
     let out_a = 64u * workgroup.y + 8u * member;
     let out_b = out_a + 4u;
     let group = workgroup.z;

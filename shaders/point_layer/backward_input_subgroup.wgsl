@@ -116,7 +116,7 @@ fn put(at: u32, value: f32) {
     }
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(subgroup_id) subgroup: u32,
@@ -129,7 +129,7 @@ fn main(
     let member = lane % 8u;
     let octet = lane - member;
     let team = (subgroup * subgroup_size + lane) / 8u;
-    let first = 256u * workgroup.x + 32u * team;
+    let first = 128u * workgroup.x + 32u * team;
     let group = workgroup.z;
     if (first >= params.rows_per_group) {
         return;

@@ -99,7 +99,7 @@ fn put(group: u32, row: u32, end: u32, column: u32, value: vec4<f32>) {
     }
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(subgroup_id) subgroup: u32,
@@ -112,7 +112,7 @@ fn main(
     let member = lane % 8u;
     let octet = lane - member;
     let team = (subgroup * subgroup_size + lane) / 8u;
-    let first = 256u * workgroup.x + 32u * team;
+    let first = 128u * workgroup.x + 32u * team;
     let group = workgroup.z;
     if (first >= params.rows_per_group) {
         return;

@@ -86,13 +86,13 @@ table! {
         (x: f32, weights: f32, slots: u32) -> (y: f32),
         or "forward_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
         or "forward_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
-        or "forward_subgroup" tile [256, 64, 1], when [FeaturesMultipleOf4, Subgroups];
+        or "forward_subgroup" tile [128, 64, 1], when [FeaturesMultipleOf4, Subgroups];
     /// `d_x[r,i] (+)= Σ_{o=first_out}^{end_out-1} W[o,i] d_y[r,o]`. Extent: rows of a group × in_features × groups.
     LINEAR_BACKWARD_INPUT = "linear"/"backward_input", LinearParams, tile [64, 32, 1],
         (d_y: f32, weights: f32, slots: u32) -> (d_x: f32),
         or "backward_input_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
         or "backward_input_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
-        or "backward_input_subgroup" tile [256, 64, 1], when [FeaturesMultipleOf4, Subgroups];
+        or "backward_input_subgroup" tile [128, 64, 1], when [FeaturesMultipleOf4, Subgroups];
     /// `partial[g,c] (+)= (Σ_r d_y[r,o] x[r,i], Σ_r d_y[r,o])` over the rows of chunk `c`: weight, then bias; `[groups, chunks, out·in + out]`.
     /// Extent: out_features × in_features × (groups · chunks). (Independent of `slots`: group `g` writes set `g`.)
     LINEAR_BACKWARD_WEIGHT = "linear"/"backward_weight", LinearParams, tile [32, 32, 1],
@@ -105,12 +105,12 @@ table! {
     LAYER_NORM_RELU_FORWARD = "layer_norm_relu"/"forward", LayerNormParams, tile FLAT,
         (x: f32, affine: f32) -> (y: f32, stats: f32),
         or "forward_vec4" tile FLAT, when [FeaturesMultipleOf4],
-        or "forward_subgroup" tile [256, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "forward_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Gradient to `x`: with `e = gamma · d_y` where `y > 0`, else 0: `d_x = rstd (e - mean(e) - x̂ mean(e x̂))`. Extent: rows.
     LAYER_NORM_RELU_BACKWARD_INPUT = "layer_norm_relu"/"backward_input", LayerNormParams, tile FLAT,
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (d_x: f32),
         or "backward_input_vec4" tile FLAT, when [FeaturesMultipleOf4],
-        or "backward_input_subgroup" tile [256, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "backward_input_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Sums of `d_y x̂` and `d_y` (where `y > 0`) over the rows of each chunk: `partial [chunks, 2, features]`. Extent: features × chunks.
     LAYER_NORM_RELU_BACKWARD_AFFINE = "layer_norm_relu"/"backward_affine", LayerNormParams, tile [64, 1, 1],
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32),
@@ -120,11 +120,11 @@ table! {
     /// Extent: rows of a group × 1 × groups.
     POINT_LAYER_FORWARD = "point_layer"/"forward", PointLayerParams, tile FLAT,
         (x: f32, weights: f32, slots: u32, affine: f32) -> (y: f32),
-        or "forward_subgroup" tile [256, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "forward_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// `d_x (+)= Wᵀ d_z`, `d_z` as the gradient of `layer_norm_relu`. Extent: rows of a group × 1 × groups.
     POINT_LAYER_BACKWARD_INPUT = "point_layer"/"backward_input", PointLayerParams, tile FLAT,
         (x: f32, weights: f32, slots: u32, affine: f32, d_y: f32) -> (d_x: f32),
-        or "backward_input_subgroup" tile [256, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "backward_input_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Gates in the order i, f, g, o: `c = σ(f) c_prev + σ(i) tanh(g)`, `h = σ(o) tanh(c)`.
     /// `gates [rows, 4·hidden]` before activation, `c_prev [rows, hidden]` → `h, c [rows, hidden]`. Extent: rows · hidden.
     LSTM_CELL_FORWARD = "lstm_cell"/"forward", LstmParams, tile FLAT,

@@ -41,7 +41,8 @@ fn every_kernel_has_one_entry_point_main() {
         assert_eq!(module.entry_points.len(), 1, "{label}");
         let main = &module.entry_points[0];
         assert_eq!((main.name.as_str(), main.stage), ("main", ShaderStage::Compute), "{label}");
-        assert_eq!(main.workgroup_size.iter().product::<u32>(), 64, "{label}");
+        // Of 32 where an invocation does much: a few hundred rows are then work for more than a few of a device's cores.
+        assert!([32, 64].contains(&main.workgroup_size.iter().product::<u32>()), "{label}");
         for (tile, size) in variant.tile.iter().zip(main.workgroup_size) {
             assert_eq!(tile % size, 0, "{label}: tile {:?}, workgroup {:?}", variant.tile, main.workgroup_size);
         }

@@ -26,7 +26,7 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_subgroup", "f32(c < params.features / 4u)", "1.0"),
         ("forward_subgroup", "octet + 5u / per_row", "octet"),
         ("forward_subgroup", "subgroupShuffleXor(mean, 4u)", "subgroupShuffleXor(mean, 2u)"),
-        ("forward_subgroup", "256u * workgroup.x + 32u * team", "256u * workgroup.x + 16u * team"),
+        ("forward_subgroup", "128u * workgroup.x + 32u * team", "128u * workgroup.x + 16u * team"),
         ("forward_subgroup", "max(value, vec4(0.0))", "value"),
         ("forward_subgroup", "end, c6, gamma6 * (z6 * rstd.b.z)", "end, c6, gamma6 * (z6 * rstd.b.x)"),
     ],
