@@ -11,3 +11,12 @@ fn stable_tanh(x: f32) -> f32 {
     let p = (((-5.70498872745e-3 * z + 2.06390887954e-2) * z - 5.37397155531e-2) * z + 1.33314422036e-1) * z - 3.33332819422e-1;
     return select(sign(x) * (1.0 - 2.0 / (exp(2.0 * a) + 1.0)), x + x * z * p, a < 0.625);
 }
+
+// Of four values.
+fn sigmoids(x: vec4<f32>) -> vec4<f32> {
+    return vec4(sigmoid(x.x), sigmoid(x.y), sigmoid(x.z), sigmoid(x.w));
+}
+
+fn tangents(x: vec4<f32>) -> vec4<f32> {
+    return vec4(stable_tanh(x.x), stable_tanh(x.y), stable_tanh(x.z), stable_tanh(x.w));
+}

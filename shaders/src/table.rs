@@ -128,10 +128,12 @@ table! {
     /// Gates in the order i, f, g, o: `c = σ(f) c_prev + σ(i) tanh(g)`, `h = σ(o) tanh(c)`.
     /// `gates [rows, 4·hidden]` before activation, `c_prev [rows, hidden]` → `h, c [rows, hidden]`. Extent: rows · hidden.
     LSTM_CELL_FORWARD = "lstm_cell"/"forward", LstmParams, tile FLAT,
-        (gates: f32, c_prev: f32) -> (h: f32, c: f32);
+        (gates: f32, c_prev: f32) -> (h: f32, c: f32),
+        or "forward_vec4" tile [256, 1, 1], when [FeaturesMultipleOf4];
     /// Clamps `d_h` to ±10, then back to the gates (before activation) and to `c_prev`; `d_c` arrives from the next step.
     LSTM_CELL_BACKWARD = "lstm_cell"/"backward", LstmParams, tile FLAT,
-        (gates: f32, c_prev: f32, c: f32, d_h: f32, d_c: f32) -> (d_gates: f32, d_c_prev: f32);
+        (gates: f32, c_prev: f32, c: f32, d_h: f32, d_c: f32) -> (d_gates: f32, d_c_prev: f32),
+        or "backward_vec4" tile [256, 1, 1], when [FeaturesMultipleOf4];
     /// `step = ⟨head, h⟩ + bias`, `x_next = x + direction · step`; `x, direction, x_next [rows,3]`, `h [rows, hidden]`, `head [hidden + 1]`,
     /// `step [rows]`. Extent: rows.
     ADVANCE_FORWARD = "advance"/"forward", AdvanceParams, tile FLAT,

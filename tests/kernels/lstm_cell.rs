@@ -15,6 +15,10 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward", "o * stable_tanh(cell)", "o * cell"),
         ("forward", "4u * params.hidden +", "3u * params.hidden +"),
         ("forward", "1.33314422036e-1", "1.33514422036e-1"),
+        ("forward_vec4", "gate + 3u * n", "gate + 2u * n"),
+        ("forward_vec4", "sigmoid(x.z)", "sigmoid(x.w)"),
+        ("forward_vec4", "o * tangents(cell)", "o * cell"),
+        ("forward_vec4", "index % n", "index % 2u"),
     ],
 };
 
@@ -29,6 +33,10 @@ pub static BACKWARD: KernelTest = KernelTest {
         ("backward", "d_c[index] + ", "0.0 * d_c[index] + "),
         ("backward", "d_cell * f;", "d_cell * i;"),
         ("backward", "d_hidden * tanh_c", "d_cell * tanh_c"),
+        ("backward_vec4", "vec4(-10.0), vec4(10.0)", "vec4(-11.0), vec4(11.0)"),
+        ("backward_vec4", "stable_tanh(x.y)", "stable_tanh(x.x)"),
+        ("backward_vec4", "i * (1.0 - g * g)", "i * (1.0 - g)"),
+        ("backward_vec4", "d_cell * f;", "d_cell * i;"),
     ],
 };
 
@@ -42,7 +50,7 @@ fn backward_matches_reference() {
     BACKWARD.matches_reference();
 }
 
-const SIZES: [(u32, u32); 4] = [(1, 3), (7, 17), (129, 16), (33, 30)];
+const SIZES: [(u32, u32); 5] = [(1, 3), (7, 17), (129, 16), (33, 30), (70, 12)];
 
 /// Gates from the linear to the saturated range.
 fn gates(s: &mut Sketch, len: usize) -> Vec<f32> {
