@@ -1,9 +1,9 @@
-//! Layers that stay on the host train as those on the device do.
+//! Layers that stay on the host do as those on the device do.
 
-use sigma_srn::{Engine, Model, ModelConfig, Train, Trainer};
+use sigma_srn::{Descent, Engine, Model, ModelConfig, Renderer, Shape, Train, Trainer};
 use srn_tests::{assert_close, difference, gpu};
 
-use crate::{INSTANCES, batch, trainer};
+use crate::{INSTANCES, SIZE, batch, intrinsics, methods, poses, trainer, weights};
 
 const IMAGES: u32 = 5;
 /// Less than twice the parameters, with their gradients and moments where they are trained: three layers of the hypernetwork are streamed, in
@@ -26,6 +26,11 @@ fn model() -> Model {
     let codes = model.hypernetwork().unwrap().codes;
     model.parameters[codes].values.iter_mut().for_each(|value| *value *= 30.0);
     model
+}
+
+/// The engine, and one whose budget is too small for the parameters of a network that is not trained.
+fn roomy_and_small(engine: &Engine) -> [Engine; 2] {
+    [engine.clone(), engine.clone().with_budget(budget(engine, Train::Codes))]
 }
 
 /// On the device, and streamed.
@@ -111,5 +116,45 @@ fn a_checkpoint_continues_on_the_host_and_on_the_device() {
         assert!(streamed == want || engine.to_string() == "cpu64", "{engine}: not the same bits");
         assert_same(&format!("{engine}, on from a checkpoint"), tensors(streamed), tensors(want), tolerance);
         assert_same(&format!("{engine}, on from a checkpoint on the device"), tensors(resident), tensors(want), tolerance);
+    }
+}
+
+#[test]
+fn pictures_are_the_same() {
+    for (engine, tolerance) in engines() {
+        let [want, got] = roomy_and_small(&engine).map(|engine| {
+            let cameras: Vec<_> = poses(3).into_iter().map(|pose| (pose.to_matrix(), intrinsics())).collect();
+            let mut renderer = Renderer::new(&engine, &model(), 3, SIZE[0], SIZE[1]).unwrap();
+            // Other instances after the first ones.
+            [[0, 1, 2], [2, 0, 2]].map(|instances| renderer.render(&instances, &cameras, 7).unwrap())
+        });
+        for (got, want) in got.iter().zip(&want) {
+            println!("{:.1e}: {engine}, colours", difference(&got.rgb, &want.rgb).unwrap());
+            assert_close(&format!("{engine}, colours"), &got.rgb, &want.rgb, tolerance);
+            assert_close(&format!("{engine}, depths"), &got.depth, &want.depth, tolerance);
+        }
+    }
+}
+
+#[test]
+fn gradients_of_poses_are_the_same() {
+    const HYPOTHESES: u32 = 2;
+    let batch = batch(HYPOTHESES);
+    for ((engine, tolerance), method) in
+        engines().into_iter().flat_map(|case| methods().into_iter().map(move |m| (case.clone(), m)))
+    {
+        let [want, got] = roomy_and_small(&engine).map(|engine| {
+            let shape = Shape { hypotheses: HYPOTHESES, width: SIZE[0], height: SIZE[1], instances: 2 };
+            let mut descent = Descent::new(&engine, &model(), shape, method).unwrap();
+            assert!(descent.bytes() <= engine.budget());
+            let weights = weights(method, HYPOTHESES);
+            descent.set_targets(&[3, 1], &[1, 0], &batch.rays, &batch.target_rgb, weights.as_deref()).unwrap();
+            descent.set_poses(&poses(HYPOTHESES)).unwrap();
+            descent.evaluate().unwrap();
+            descent.gradients().unwrap().as_flattened().iter().map(|&d| d as f32).collect::<Vec<_>>()
+        });
+        let what = format!("{engine}, {method:?}");
+        println!("{:.1e}: {what}", difference(&got, &want).unwrap());
+        assert_close(&what, &got, &want, tolerance);
     }
 }

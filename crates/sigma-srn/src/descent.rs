@@ -10,7 +10,9 @@ use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, Tile, tiles};
 use crate::camera::{Pose6, from_rows, to_rows};
 use crate::engine::{Engine, Runner};
 use crate::model::Model;
-use crate::network::{Batch, Network, Purpose, Saved, Scratch, Started, Trainable, backward, forward};
+use crate::network::forward::{self, Instances};
+use crate::network::streamed::OnHost;
+use crate::network::{Batch, Network, Purpose, Saved, Scratch, Started, Trainable, backward};
 use crate::rays::wanted;
 use crate::{Error, Rays};
 
@@ -84,7 +86,7 @@ struct Handles {
     /// See [`wanted`] `[hypotheses, rays, 4]`; for GMSD, which knows no weights, colours `[hypotheses, rays, 3]`.
     target: BufferId,
     gmsd: bool,
-    instances: StageId,
+    instances: Instances,
     /// What follows from the targets alone.
     targets: StageId,
     compare: StageId,
@@ -125,10 +127,12 @@ impl Descent {
             return Err(Error::Setting { field: "loss", what: format!("GMSD needs 2 × 2 pixels, got {width} × {height}") });
         }
         let rows = hypotheses * width * height;
-        let (plan, handles) =
-            engine.fit(rows, model.layout.features(), Purpose::Pose, |b, tile_rows| build(b, model, shape, method, tile_rows))?;
+        let on_host = OnHost::of(engine, model, 1);
+        let (plan, mut handles) = engine.fit(rows, model.layout.features(), Purpose::Pose, |b, tile_rows| {
+            build(b, model, shape, method, tile_rows, &on_host)
+        })?;
         let mut runner = engine.prepare(plan)?;
-        handles.network.upload(&mut *runner, model)?;
+        handles.instances.upload(&mut *runner, &handles.network, model)?;
         if let Moves::Bfgs { seeds, .. } = handles.moves {
             for (channel, seed) in seeds.into_iter().enumerate() {
                 let len = runner.plan().buffer(seed).len;
@@ -204,7 +208,7 @@ impl Descent {
             true => self.runner.write(self.handles.target, target_rgb)?,
             false => self.runner.write(self.handles.target, &wanted(target_rgb, weights))?,
         }
-        self.runner.run(self.handles.instances)?;
+        self.handles.instances.run(&mut *self.runner)?;
         Ok(self.runner.run(self.handles.targets)?)
     }
 
@@ -327,13 +331,20 @@ fn six_numbers(values: &[f32]) -> Vec<[f64; 6]> {
     values.chunks_exact(6).map(|six| std::array::from_fn(|k| six[k].into())).collect()
 }
 
-fn build(b: &mut Builder, model: &Model, shape: Shape, method: Method, tile_rows: u32) -> Result<Handles, PlanError> {
+fn build(
+    b: &mut Builder,
+    model: &Model,
+    shape: Shape,
+    method: Method,
+    tile_rows: u32,
+    on_host: &OnHost,
+) -> Result<Handles, PlanError> {
     let Shape { hypotheses, width, height, instances: slots } = shape;
     let rays_per_image = width * height;
     let batch = Batch { images: hypotheses, rays: rays_per_image, slots };
     // Adam's matrices come from six numbers, those of BFGS are what it moves.
     let pose_is_input = matches!(method, Method::Bfgs { .. });
-    let network = Network::new(b, model, batch, Trainable::Nothing, pose_is_input, &[])?;
+    let network = Network::new(b, model, batch, Trainable::Nothing, pose_is_input, &on_host.parameters)?;
     let cut = tiles(hypotheses, rays_per_image, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
     let saved = Saved::new(b, &network, Purpose::Pose, most)?;
@@ -341,7 +352,7 @@ fn build(b: &mut Builder, model: &Model, shape: Shape, method: Method, tile_rows
     let gmsd = matches!(method, Method::Adam { loss: Loss::Gmsd, .. });
     let target = b.input("target", if gmsd { 3 } else { 4 } * hypotheses as usize * rays_per_image as usize)?;
 
-    let instances = forward::instances(b, &network)?;
+    let instances = Instances::new(b, &network, model, on_host)?;
 
     let loss = match method {
         Method::Adam { loss, .. } => loss.per_pixel(),

@@ -8,7 +8,9 @@ use srn_plan::{BufferId, Builder, PlanError, StageId, tiles};
 use crate::camera::Intrinsics;
 use crate::engine::{Engine, Runner};
 use crate::model::Model;
-use crate::network::{Batch, Network, Purpose, Saved, Trainable, forward};
+use crate::network::forward::{self, Instances};
+use crate::network::streamed::OnHost;
+use crate::network::{Batch, Network, Purpose, Saved, Trainable};
 use crate::random::stream;
 use crate::{Error, Rays, pixel_grid};
 
@@ -24,7 +26,7 @@ pub struct Rendering {
 struct Handles {
     network: Network,
     packed: BufferId,
-    instances: StageId,
+    instances: Instances,
     render: StageId,
     pack: StageId,
 }
@@ -51,11 +53,12 @@ impl Renderer {
         }
         let rays = width * height;
         let size = [width, height];
-        let (plan, handles) = engine.fit(views * rays, model.layout.features(), Purpose::Render, |b, tile_rows| {
-            build(b, model, views, size, tile_rows)
+        let on_host = OnHost::of(engine, model, 1);
+        let (plan, mut handles) = engine.fit(views * rays, model.layout.features(), Purpose::Render, |b, tile_rows| {
+            build(b, model, views, size, tile_rows, &on_host)
         })?;
         let mut runner = engine.prepare(plan)?;
-        handles.network.upload(&mut *runner, model)?;
+        handles.instances.upload(&mut *runner, &handles.network, model)?;
         let slots: Vec<u32> = (0..views).collect();
         runner.write_u32(handles.network.slots, &slots)?;
         Ok(Renderer { runner, handles, width, height, views, instances: None })
@@ -98,7 +101,7 @@ impl Renderer {
         }
         if self.instances.as_deref() != Some(instances) {
             self.runner.write_u32(network.index, instances)?;
-            self.runner.run(self.handles.instances)?;
+            self.handles.instances.run(&mut *self.runner)?;
             self.instances = Some(instances.to_vec());
         }
         Ok(())
@@ -147,14 +150,22 @@ pub(crate) fn scene_weights(model: &Model, instance: u32) -> Result<Vec<Vec<f32>
     handles.network.scene.iter().map(|block| Ok(runner.read(block.layer.weights)?)).collect()
 }
 
-fn build(b: &mut Builder, model: &Model, views: u32, [width, height]: [u32; 2], tile_rows: u32) -> Result<Handles, PlanError> {
+fn build(
+    b: &mut Builder,
+    model: &Model,
+    views: u32,
+    [width, height]: [u32; 2],
+    tile_rows: u32,
+    on_host: &OnHost,
+) -> Result<Handles, PlanError> {
     let rays = width * height;
-    let network = Network::new(b, model, Batch { images: views, rays, slots: views }, Trainable::Nothing, true, &[])?;
+    let network =
+        Network::new(b, model, Batch { images: views, rays, slots: views }, Trainable::Nothing, true, &on_host.parameters)?;
     let cut = tiles(views, rays, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
     let saved = Saved::new(b, &network, Purpose::Render, most)?;
     let packed = b.scratch_u32("packed rgba8", (pack_rgba8::stride(width) * height) as usize)?;
-    let instances = forward::instances(b, &network)?;
+    let instances = Instances::new(b, &network, model, on_host)?;
     let render = b.stage("render");
     for &tile in &cut {
         forward::render(b, &network, &saved, tile)?;

@@ -10,7 +10,7 @@ use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, tiles};
 use crate::engine::{Engine, Runner};
 use crate::model::{Model, Tensors, read_tensors, write_tensors};
 use crate::network::backward::{self, HyperScratch};
-use crate::network::streamed::{self, Streamed};
+use crate::network::streamed::{OnHost, Streamed};
 use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, SourceBuffers, Started, Trainable, forward};
 use crate::rays::wanted;
 use crate::{Error, Rays};
@@ -105,9 +105,10 @@ impl Trainer {
         }
         model.hypernetwork()?;
         let features = model.layout.features();
-        let most = most_resident(engine, &model, train);
+        // Value, gradient and two moments.
+        let on_host = OnHost::of(engine, &model, if train == Train::Everything { 4 } else { 1 });
         let (plan, handles) = engine
-            .fit(images * rays, features, Purpose::Train, |b, tile_rows| build(b, &model, train, batch, tile_rows, most))?;
+            .fit(images * rays, features, Purpose::Train, |b, tile_rows| build(b, &model, train, batch, tile_rows, &on_host))?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, &model)?;
         let slots: Vec<u32> = (0..images).collect();
@@ -162,11 +163,11 @@ impl Trainer {
         let Handles { streamed, before, render, after, .. } = &mut self.handles;
         self.runner.run(*before)?;
         if let Some(streamed) = streamed {
-            streamed.run_forward(&mut *self.runner, &self.model)?;
+            streamed.run_forward(&mut *self.runner, |number| &self.model.parameters[number].values)?;
         }
         self.runner.run(*render)?;
         if let Some(streamed) = streamed {
-            streamed.run_backward(&mut *self.runner, &self.model)?;
+            streamed.run_backward(&mut *self.runner, |number| &self.model.parameters[number].values)?;
         }
         self.runner.run(*after)?;
         Ok(())
@@ -291,29 +292,17 @@ fn moment_names(model: &Model, number: usize) -> [String; 2] {
     ["m", "v"].map(|kind| format!("adam.{kind}.{}", model.parameters[number].tensors[0].0))
 }
 
-/// Most values of a parameter of the hypernetwork that is on the device as a whole, and most of a part of one that is not.
-fn most_resident(engine: &Engine, model: &Model, train: Train) -> usize {
-    // Value, gradient and two moments.
-    let copies = if train == Train::Everything { 4 } else { 1 };
-    let values: usize = model.parameters.iter().map(|parameter| parameter.values.len()).sum();
-    let most = engine.max_binding_bytes() / 4;
-    let fits = copies * values as u64 * engine.value_bytes() <= engine.budget() / 2;
-    // The buffers of a part take a quarter of the budget at most.
-    if fits { most as usize } else { most.min(engine.budget() / (4 * copies * engine.value_bytes())) as usize }
-}
-
 fn build(
     b: &mut Builder,
     model: &Model,
     train: Train,
     batch: Batch,
     tile_rows: u32,
-    most_resident: usize,
+    on_host: &OnHost,
 ) -> Result<Handles, PlanError> {
     let trainable = if train == Train::Codes { Trainable::Codes } else { Trainable::Everything };
-    let is_streamed = streamed::longer_than(model, most_resident);
-    let network = Network::new(b, model, batch, trainable, true, &is_streamed)?;
-    let mut streamed = Streamed::new(b, model, batch, &is_streamed, most_resident, train == Train::Everything)?;
+    let network = Network::new(b, model, batch, trainable, true, &on_host.parameters)?;
+    let mut streamed = Streamed::new(b, model, batch, on_host, train == Train::Everything)?;
     let (images, rays) = (batch.images, batch.rays);
     let rows = images * rays;
     let cut = tiles(images, rays, tile_rows);

@@ -1,32 +1,67 @@
 //! Forward pass (spec 2).
 
+use std::collections::BTreeMap;
+
 use srn_plan::ops::embedding::Embedding;
 use srn_plan::ops::layer_norm_relu::Saved as NormSaved;
 use srn_plan::ops::rays::Pixels;
 use srn_plan::ops::{
     advance, density_sum, depth, embedding, layer_norm_relu, linear, lstm_cell, point_layer, rays, tile as tile_ops,
 };
-use srn_plan::{BufferId, Builder, PlanError, Rows, StageId, Tile};
+use srn_plan::{BufferId, Builder, Executor, ExecutorError, PlanError, Rows, StageId, Tile};
 
+use super::streamed::{OnHost, Streamed};
 use super::{BlockBuffers, BlockSaved, HyperBuffers, HyperSaved, Network, Saved, SourceBuffers};
+use crate::model::Model;
 
-/// The stage that makes the weights of f for each slot: by the hypernetwork, or as they are stored.
-pub(crate) fn instances(b: &mut Builder, network: &Network) -> Result<StageId, PlanError> {
-    match &network.source {
-        SourceBuffers::Hypernetwork(hyper) => {
-            let saved = HyperSaved::new(b, network, hyper)?;
-            let stage = b.stage("instances");
-            hypernetwork(b, network, hyper, &saved)?;
-            Ok(stage)
-        }
-        // A table with one row, each slot's index 0.
-        SourceBuffers::Baked(stored) => {
-            let stage = b.stage("instances");
-            for (&stored, scene) in stored.iter().zip(&network.scene) {
-                let table = Embedding { batch: network.batch.slots, instances: 1, latent: scene.layer.parameters() };
-                embedding::forward(b, table, stored, network.index, scene.layer.weights)?;
+/// Makes the weights of f for each slot, where nothing is trained: by the hypernetwork, or as they are stored.
+#[derive(Debug)]
+pub(crate) struct Instances {
+    stage: StageId,
+    streamed: Option<Streamed>,
+    /// Values of the parameters that are streamed.
+    on_host: BTreeMap<usize, Vec<f32>>,
+}
+
+impl Instances {
+    /// Adds the stages.
+    pub fn new(b: &mut Builder, network: &Network, model: &Model, on_host: &OnHost) -> Result<Self, PlanError> {
+        let mut streamed = Streamed::new(b, model, network.batch, on_host, false)?;
+        let stage = match &network.source {
+            SourceBuffers::Hypernetwork(hyper) => {
+                let saved = HyperSaved::new(b, network, hyper)?;
+                let stage = b.stage("instances");
+                hypernetwork(b, network, hyper, &saved)?;
+                if let Some(streamed) = &mut streamed {
+                    streamed.forward(b, network, &saved)?;
+                }
+                stage
             }
-            Ok(stage)
+            // A table with one row, each slot's index 0.
+            SourceBuffers::Baked(stored) => {
+                let stage = b.stage("instances");
+                for (&stored, scene) in stored.iter().zip(&network.scene) {
+                    let table = Embedding { batch: network.batch.slots, instances: 1, latent: scene.layer.parameters() };
+                    embedding::forward(b, table, stored, network.index, scene.layer.weights)?;
+                }
+                stage
+            }
+        };
+        Ok(Instances { stage, streamed, on_host: BTreeMap::new() })
+    }
+
+    /// Writes the parameters, those that are streamed to the host.
+    pub fn upload(&mut self, executor: &mut dyn Executor, network: &Network, model: &Model) -> Result<(), ExecutorError> {
+        self.on_host = network.upload(executor, model)?;
+        Ok(())
+    }
+
+    /// Runs the stages.
+    pub fn run(&mut self, executor: &mut dyn Executor) -> Result<(), ExecutorError> {
+        executor.run(self.stage)?;
+        match &mut self.streamed {
+            Some(streamed) => streamed.run_forward(executor, |number| &self.on_host[&number]),
+            None => Ok(()),
         }
     }
 }

@@ -7,7 +7,7 @@ pub(crate) mod forward;
 mod saved;
 pub(crate) mod streamed;
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 
 use srn_plan::ops::linear::{Layer, Sets};
 use srn_plan::ops::point_layer;
@@ -242,19 +242,27 @@ impl Network {
     }
 
     /// Writes the parameters and constants into an executor; where nothing is trained, without the means that a norm takes off anyway.
-    pub fn upload(&self, executor: &mut dyn srn_plan::Executor, model: &Model) -> Result<(), srn_plan::ExecutorError> {
+    /// Returns what it would have written of those that are streamed, by their numbers, if nothing is trained.
+    pub fn upload(
+        &self,
+        executor: &mut dyn srn_plan::Executor,
+        model: &Model,
+    ) -> Result<BTreeMap<usize, Vec<f32>>, srn_plan::ExecutorError> {
+        let mut on_host = BTreeMap::new();
+        let is_frozen = self.trainable == Trainable::Nothing;
         for (number, (buffer, parameter)) in self.parameters.iter().zip(&model.parameters).enumerate() {
-            let Some(buffer) = *buffer else { continue };
-            let is_frozen = self.trainable == Trainable::Nothing;
-            match is_frozen.then(|| centred::centred(&model.layout, number, parameter)).flatten() {
-                Some(values) => executor.write_f64(buffer, &values)?,
-                None => executor.write(buffer, &parameter.values)?,
+            let centred = is_frozen.then(|| centred::centred(&model.layout, number, parameter)).flatten();
+            match (*buffer, centred) {
+                (Some(buffer), Some(values)) => executor.write_f64(buffer, &values)?,
+                (Some(buffer), None) => executor.write(buffer, &parameter.values)?,
+                (None, Some(values)) => drop(on_host.insert(number, values.iter().map(|&value| value as f32).collect())),
+                (None, None) => {}
             }
         }
         for &(buffer, width) in &self.identity {
             executor.write(buffer, &[vec![1.0; width as usize], vec![0.0; width as usize]].concat())?;
         }
-        Ok(())
+        Ok(on_host)
     }
 }
 

@@ -1,5 +1,5 @@
 //! Output layers of the hypernetwork that would fill the memory budget: they and their moments stay on the host, and the device has a part
-//! of one at a time, some of its outputs. Their values are those of the model that is trained.
+//! of one at a time, some of its outputs.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -10,13 +10,31 @@ use srn_plan::{BufferId, Builder, Executor, ExecutorError, PlanError, Rows, Stag
 
 use super::backward::HyperScratch;
 use super::{Batch, HyperSaved, Network, Started};
+use crate::engine::Engine;
 use crate::model::{Kind, Model, Source};
 
-/// Numbers of the parameters that are longer than `most` and can be streamed.
-pub(crate) fn longer_than(model: &Model, most: usize) -> Vec<usize> {
-    let parameters = model.parameters.iter().enumerate();
-    let long = parameters.filter(|(_, parameter)| parameter.kind == Kind::HyperOutput && parameter.values.len() > most);
-    long.map(|(number, _)| number).collect()
+/// Which parameters stay on the host, and how much of one the device gets at a time.
+#[derive(Clone, Debug)]
+pub(crate) struct OnHost {
+    /// Their numbers in the model.
+    pub parameters: Vec<usize>,
+    /// Values of a part, at most.
+    most: usize,
+}
+
+impl OnHost {
+    /// Those that are large, where all parameters would take more than half of the engine's memory budget, and those that no buffer holds.
+    /// `copies`: how often the device has each parameter; 1, or 4 with its gradient and moments.
+    pub fn of(engine: &Engine, model: &Model, copies: u64) -> Self {
+        let values: usize = model.parameters.iter().map(|parameter| parameter.values.len()).sum();
+        let fits = copies * values as u64 * engine.value_bytes() <= engine.budget() / 2;
+        // The buffers of a part take a quarter of the budget at most.
+        let of_budget = if fits { u64::MAX } else { engine.budget() / (4 * copies * engine.value_bytes()) };
+        let most = of_budget.min(engine.max_binding_bytes() / 4) as usize;
+        let parameters = model.parameters.iter().enumerate();
+        let large = parameters.filter(|(_, parameter)| parameter.kind == Kind::HyperOutput && parameter.values.len() > most);
+        OnHost { parameters: large.map(|(number, _)| number).collect(), most }
+    }
 }
 
 /// Some outputs of a layer.
@@ -88,21 +106,20 @@ pub(crate) struct Streamed {
 }
 
 impl Streamed {
-    /// Adds the buffers, for parts of at most `most` values; `None` where no layer is streamed.
+    /// Adds the buffers; `None` where no layer is streamed.
     pub fn new(
         b: &mut Builder,
         model: &Model,
         batch: Batch,
-        streamed: &[usize],
-        most: usize,
+        on_host: &OnHost,
         is_trained: bool,
     ) -> Result<Option<Self>, PlanError> {
         let Source::Hypernetwork(hypernetwork) = &model.layout.source else { return Ok(None) };
         let outputs = hypernetwork.layers.iter().enumerate().filter_map(|(scene, mlp)| Some((scene, mlp.last()?)));
-        let outputs: Vec<_> = outputs.filter(|(_, block)| streamed.contains(&block.linear)).collect();
+        let outputs: Vec<_> = outputs.filter(|(_, block)| on_host.parameters.contains(&block.linear)).collect();
         let mut cut = Vec::new();
         for &(scene, block) in &outputs {
-            let most_outputs = most / (block.in_features as usize + 1);
+            let most_outputs = on_host.most / (block.in_features as usize + 1);
             cut.extend(tiles(1, block.out_features, most_outputs as u32).into_iter().map(|tile| (scene, block, tile)));
         }
         let longest = |width: fn(u32) -> u32| {
@@ -114,7 +131,8 @@ impl Streamed {
             true => Some(Trained {
                 d_weights: b.scratch("d part of hyper", len)?,
                 moments: [b.input("m part of hyper", len)?, b.input("v part of hyper", len)?],
-                host_moments: streamed
+                host_moments: on_host
+                    .parameters
                     .iter()
                     .map(|&number| (number, [(); 2].map(|()| vec![0.0; model.parameters[number].values.len()])))
                     .collect(),
@@ -206,16 +224,24 @@ impl Streamed {
         tile_ops::gather(b, part.tile, 1, d_weights, self.outputs)
     }
 
-    /// Runs the stages of [`Streamed::forward`].
-    pub fn run_forward(&mut self, executor: &mut dyn Executor, model: &Model) -> Result<(), ExecutorError> {
+    /// Runs the stages of [`Streamed::forward`]; `home` has the values of each parameter.
+    pub fn run_forward<'a>(
+        &mut self,
+        executor: &mut dyn Executor,
+        home: impl Fn(usize) -> &'a [f32],
+    ) -> Result<(), ExecutorError> {
         let Self { parts, weights, forward, values, .. } = self;
-        run(executor, model, parts, forward, *weights, values)
+        run(executor, home, parts, forward, *weights, values)
     }
 
-    /// Runs the stages of [`Streamed::backward`].
-    pub fn run_backward(&mut self, executor: &mut dyn Executor, model: &Model) -> Result<(), ExecutorError> {
+    /// Runs the stages of [`Streamed::backward`]; `home` has the values of each parameter.
+    pub fn run_backward<'a>(
+        &mut self,
+        executor: &mut dyn Executor,
+        home: impl Fn(usize) -> &'a [f32],
+    ) -> Result<(), ExecutorError> {
         let Self { parts, weights, backward, values, .. } = self;
-        run(executor, model, parts, backward, *weights, values)
+        run(executor, home, parts, backward, *weights, values)
     }
 
     /// Runs the stages of [`Streamed::update`]: values and moments of each part go to the device and come back.
@@ -268,16 +294,16 @@ impl Streamed {
 }
 
 /// Runs the stage of each part, its values brought to the device before.
-fn run(
+fn run<'a>(
     executor: &mut dyn Executor,
-    model: &Model,
+    home: impl Fn(usize) -> &'a [f32],
     parts: &[Part],
     stages: &[StageId],
     weights: BufferId,
     values: &mut [f32],
 ) -> Result<(), ExecutorError> {
     for (part, &stage) in parts.iter().zip(stages) {
-        part.cut(&model.parameters[part.parameter].values, values);
+        part.cut(home(part.parameter), values);
         executor.write(weights, values)?;
         executor.run(stage)?;
     }
