@@ -132,7 +132,7 @@ impl Trainer {
         parameters.filter(|(_, buffer)| buffer.is_none()).map(|(parameter, _)| 4 * parameter.values.len() as u64).sum()
     }
 
-    /// One step of Adam at `learning_rate`; returns at once on a GPU.
+    /// One step of Adam at `learning_rate`; returns at once on a GPU, but waits for it where layers stay on the host.
     pub fn step(&mut self, batch: &TrainingBatch, learning_rate: f64) -> Result<(), Error> {
         self.gradients(batch)?;
         self.steps += 1;
