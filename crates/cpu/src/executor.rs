@@ -7,7 +7,7 @@ use srn_shaders::{
 };
 
 use crate::chain::{Chain, Link, RowWise, Split};
-use crate::{Real, chain, ops};
+use crate::{Real, chain, hidden_layer, ops};
 
 /// The values of one buffer.
 #[derive(Clone, Debug)]
@@ -215,8 +215,17 @@ impl<T: Real> CpuExecutor<T> {
             }
         }
         let run = |(number, mut parts): (usize, Vec<Part<T>>)| {
-            for (step, link) in steps.iter().zip(&chain.links) {
-                dispatch(step, chain.blocks.get(number), &mut parts, link);
+            let rows = chain.blocks.get(number);
+            let mut number = 0;
+            while number < steps.len() {
+                let (steps, links) = (&steps[number..], &chain.links[number..]);
+                number += match rows {
+                    Some(rows) if both_of_a_layer(steps, rows, &mut parts, links) => 2,
+                    _ => {
+                        dispatch(&steps[0], rows, &mut parts, &links[0]);
+                        1
+                    }
+                };
             }
         };
         // In a single block, a product may be split by the matrix library.
@@ -293,6 +302,60 @@ impl<T: Real> Executor for CpuExecutor<T> {
     fn describe(&self) -> String {
         format!("cpu {}, {} threads", T::NAME, rayon::current_num_threads())
     }
+}
+
+/// Runs the first two steps on a block of rows, if they are a linear layer and its norm, forward or back, that go together.
+fn both_of_a_layer<T: Real>(steps: &[Step], rows: &Range<usize>, parts: &mut [Part<T>], links: &[Link]) -> bool {
+    let ([first, second, ..], [one, two, ..]) = (steps, links) else { return false };
+    // What is read where it is also written.
+    let unless_written = |place: usize, written: usize| (place != written).then_some(place);
+    match (first.kernel.name, second.kernel.name) {
+        ("linear/forward", "layer_norm_relu/forward") => {
+            let (linear, norm): (LinearParams, LayerNormParams) = (first.params(), second.params());
+            let (&[x, weights, slots], &[z]) = (&one.inputs[..], &one.outputs[..]) else { return false };
+            let (&[normed, affine], &[y, stats]) = (&two.inputs[..], &two.outputs[..]) else { return false };
+            if normed != z {
+                return false;
+            }
+            let [mut to_z, mut to_y, mut to_stats] = [z, y, stats].map(|place| std::mem::take(&mut parts[place]));
+            hidden_layer::forward(
+                linear.block(rows.clone()),
+                norm,
+                unless_written(x, y).map(|x| parts[x].f()),
+                parts[weights].f(),
+                parts[slots].u(),
+                parts[affine].f(),
+                to_z.f_mut(),
+                to_y.f_mut(),
+                to_stats.f_mut(),
+            );
+            [(z, to_z), (y, to_y), (stats, to_stats)].into_iter().for_each(|(place, part)| parts[place] = part);
+        }
+        ("linear/backward_input", "layer_norm_relu/backward_input") => {
+            let (linear, norm): (LinearParams, LayerNormParams) = (first.params(), second.params());
+            let (&[after, weights, slots], &[d_y]) = (&one.inputs[..], &one.outputs[..]) else { return false };
+            let (&[z, stats, affine, normed], &[d_z]) = (&two.inputs[..], &two.outputs[..]) else { return false };
+            if normed != d_y {
+                return false;
+            }
+            let [mut to_d_y, mut to_d_z] = [d_y, d_z].map(|place| std::mem::take(&mut parts[place]));
+            hidden_layer::backward(
+                linear.block(rows.clone()),
+                norm,
+                unless_written(after, d_z).map(|after| parts[after].f()),
+                parts[weights].f(),
+                parts[slots].u(),
+                parts[z].f(),
+                parts[stats].f(),
+                parts[affine].f(),
+                to_d_y.f_mut(),
+                to_d_z.f_mut(),
+            );
+            [(d_y, to_d_y), (d_z, to_d_z)].into_iter().for_each(|(place, part)| parts[place] = part);
+        }
+        _ => return false,
+    }
+    true
 }
 
 /// Outputs of a kernel, at most.

@@ -6,6 +6,8 @@
 
 mod chain;
 mod executor;
+mod hidden_layer;
+mod narrow;
 pub mod ops;
 mod real;
 mod simd;
