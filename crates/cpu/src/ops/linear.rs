@@ -1,4 +1,4 @@
-//! Linear layers: wide ones through a matrix library, narrow ones through [`narrow`].
+//! Linear layers: wide ones through a matrix library, narrow ones through `narrow.rs`.
 
 use gemm::{Parallelism, gemm};
 use rayon::prelude::*;
