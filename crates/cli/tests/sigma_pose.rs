@@ -139,8 +139,8 @@ fn presets_and_losses_are_heard() {
     assert_eq!(phases("--preset paper --steps 2"), 4);
     assert_eq!(phases("--preset paper --steps 10 --cull --loss norm_l1"), 8);
     assert_eq!(phases("--preset paper --steps 2 --loss gmsd"), 4);
-    assert_eq!(phases("--steps 6 --no-cull"), 4 * 4);
-    assert_eq!(phases("--steps 6"), 28 + 16 + 6 + 3);
+    assert_eq!(phases("--steps 6 --no-cull"), 4 * 5);
+    assert_eq!(phases("--steps 6"), 28 + 16 + 6 + 3 + 3);
 }
 
 /// A calibrated model says how far off its poses may be; the file keeps everything else.
