@@ -5,8 +5,7 @@ use std::cell::RefCell;
 
 /// Values of a vector.
 const LANES: usize = 16;
-/// Rows, and vectors of outputs of each, whose sums are held at once: with the weights of an input, all but a few of 32 registers.
-const ROWS: usize = 6;
+/// Vectors of outputs whose sums are held at once.
 const VECTORS: usize = 4;
 const COLUMNS: usize = VECTORS * LANES;
 /// Inputs at a time: their weights for [`COLUMNS`] outputs stay in the first cache.
@@ -101,6 +100,7 @@ impl Layer<'_> {
 }
 
 /// Rows of inputs, for some of the inputs and of the outputs.
+#[cfg_attr(not(target_arch = "x86_64"), expect(dead_code, reason = "there is nothing there that reads it"))]
 struct Block<'a> {
     rows: usize,
     depth: usize,
@@ -117,7 +117,10 @@ struct Block<'a> {
 mod avx512 {
     use std::arch::x86_64::*;
 
-    use super::{Begin, Block, LANES, ROWS};
+    use super::{Begin, Block, LANES};
+
+    /// Rows whose sums are held at once: with the weights of an input, they take all but a few of the 32 registers.
+    const ROWS: usize = 6;
 
     pub fn is_there() -> bool {
         is_x86_feature_detected!("avx512f")
