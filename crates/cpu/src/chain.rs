@@ -76,14 +76,15 @@ macro_rules! plain_rows {
 plain_rows!(AdvanceParams DensitySumParams LayerNormParams LstmParams);
 
 macro_rules! rows_of_groups {
-    ($($params:ident)*) => {
+    ($($params:ident: $group_matters:expr;)*) => {
         $(impl RowWise for $params {
             fn rows(&self) -> usize {
                 (self.groups * self.rows_per_group) as usize
             }
 
             fn rows_per_group(&self) -> Option<usize> {
-                Some(self.rows_per_group as usize)
+                let group_matters: fn(&Self) -> bool = $group_matters;
+                group_matters(self).then_some(self.rows_per_group as usize)
             }
 
             fn block(self, rows: Range<usize>) -> Self {
@@ -94,7 +95,13 @@ macro_rules! rows_of_groups {
     };
 }
 
-rows_of_groups!(ImageLossParams LinearParams PointLayerParams RowsParams);
+// Which group a row belongs to is all the same to a layer with one set of weights: its step has them all as one.
+rows_of_groups! {
+    ImageLossParams: |_| true;
+    LinearParams: |p| p.weight_stride > 0;
+    PointLayerParams: |p| p.weight_stride > 0;
+    RowsParams: |_| true;
+}
 
 /// How a step falls apart into rows.
 #[derive(Debug)]
@@ -212,6 +219,9 @@ fn blocks(rows: usize, rows_per_group: Option<usize>, values: usize, threads: us
 
 #[cfg(test)]
 mod tests {
+    use srn_plan::ops::linear::{self, Layer, Sets};
+    use srn_plan::{Builder, Rows};
+
     use super::*;
 
     /// Rows of the blocks on two threads.
@@ -220,6 +230,27 @@ mod tests {
         assert!(blocks.windows(2).all(|pair| pair[0].end == pair[1].start), "in order, no row twice");
         assert_eq!(blocks.iter().map(ExactSizeIterator::len).sum::<usize>(), rows, "all rows");
         blocks.iter().map(ExactSizeIterator::len).collect()
+    }
+
+    #[test]
+    fn layers_with_one_set_of_weights_belong_to_a_chain_of_groups() {
+        let mut b = Builder::new(u64::MAX);
+        let rows = Rows { groups: 3, rows_per_group: 256, first_group: 0 };
+        let sizes = [("x", 768 * 4), ("y", 768 * 4), ("z", 768 * 4), ("weights", 60), ("shared", 20)];
+        let [x, y, z, weights, shared] = sizes.map(|(name, len)| b.input(name, len).unwrap());
+        let slots = b.input_u32("slots", 3).unwrap();
+        let layer = |weights, sets| Layer { in_features: 4, out_features: 4, weights, sets };
+        b.stage("layers");
+        linear::forward(&mut b, rows, layer(weights, Sets::Slots { count: 3 }), x, slots, y, false).unwrap();
+        linear::forward(&mut b, rows, layer(shared, Sets::Shared), y, slots, z, false).unwrap();
+        let plan = b.finish().unwrap();
+        let split = |step: &Step| {
+            let p: LinearParams = step.params();
+            Some(Split { rows: p.rows(), rows_per_group: p.rows_per_group(), widths: vec![4, 0, 0, 4] })
+        };
+        let chains = Chain::of(&plan.stages[0].steps, split);
+        assert_eq!(chains.len(), 1);
+        assert!(chains[0].blocks.iter().all(|block| block.start / 256 == (block.end - 1) / 256), "{:?}", chains[0].blocks);
     }
 
     #[test]

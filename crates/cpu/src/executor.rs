@@ -279,8 +279,12 @@ impl<T: Real> Executor for CpuExecutor<T> {
     }
 
     fn run_step(&mut self, stage: StageId, step: usize) -> Result<(), ExecutorError> {
-        let step = std::slice::from_ref(&self.plan.stages[stage.index()].steps[step]);
-        Self::execute(&mut self.buffers, step, &Chain::of(step, split)[0]);
+        let (chains, steps) = (&self.chains[stage.index()], &self.plan.stages[stage.index()].steps[step..=step]);
+        let mut alone = Chain::of(steps, split).swap_remove(0);
+        // In the blocks of its chain: the matrix library adds in another order where there are other numbers of rows.
+        let chain = chains.iter().find(|chain| chain.steps.contains(&step)).expect("every step is in one");
+        alone.blocks.clone_from(&chain.blocks);
+        Self::execute(&mut self.buffers, steps, &alone);
         Ok(())
     }
 

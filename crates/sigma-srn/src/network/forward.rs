@@ -112,8 +112,8 @@ pub(crate) fn render(b: &mut Builder, network: &Network, saved: &Saved, tile: Ti
     }
     // rgb = h(phi); depth = z of x_M
     let rgb = mlp(b, rows, &network.pixel_generator, saved.phi, network.slots, &saved.pixel_generator)?;
-    tile_ops::scatter(b, tile, 3, rgb, network.rgb)?;
     depth::forward(b, rows, network.world_from_camera, saved.x[last], saved.depth)?;
+    tile_ops::scatter(b, tile, 3, rgb, network.rgb)?;
     tile_ops::scatter(b, tile, 1, saved.depth, network.depth)
 }
 
