@@ -5,7 +5,9 @@
 
 struct Params {
     rows: u32,
+    rows_per_group: u32,
     features: u32,
+    accumulate: u32,
     chunk_rows: u32,
     chunks: u32,
     centred: u32,

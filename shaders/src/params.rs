@@ -144,11 +144,15 @@ params! {
     LayerNormParams {
         /// Rows.
         rows: u32,
+        /// Rows of each group (`backward_affine`).
+        rows_per_group: u32,
         /// Values per row.
         features: u32,
+        /// 1: add to the output, 0: overwrite it (`backward_affine`).
+        accumulate: u32,
         /// Rows per partial sum (`backward_affine`).
         chunk_rows: u32,
-        /// Partial sums (`backward_affine`): `ceil(rows / chunk_rows)`.
+        /// Partial sums per group (`backward_affine`): `ceil(rows_per_group / chunk_rows)`.
         chunks: u32,
         /// 1: the rows have no mean, and none is looked for, neither of them nor, on the way back, of `e`.
         centred: u32,

@@ -1,4 +1,5 @@
 use srn_plan::ops::layer_norm_relu::{self, Saved};
+use srn_plan::{Parts, Rows};
 use srn_shaders::{LAYER_NORM_RELU_BACKWARD_AFFINE, LAYER_NORM_RELU_BACKWARD_INPUT, LAYER_NORM_RELU_FORWARD};
 use srn_tests::{Case, Sketch};
 
@@ -61,9 +62,13 @@ pub static BACKWARD_AFFINE: KernelTest = KernelTest {
     faults: &[
         ("backward_affine", "d_gamma += e * normalised", "d_gamma += e"),
         ("backward_affine", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
+        ("backward_affine", "group * params.rows_per_group", "0u * params.rows_per_group"),
+        ("backward_affine", "accumulate == 1u", "accumulate == 0u"),
         ("backward_affine", "> 0.0)", "> 1.0)"),
         ("backward_affine_vec4", "d_gamma += e * normalised", "d_gamma += e"),
         ("backward_affine_vec4", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
+        ("backward_affine_vec4", "id.y / params.chunks", "0u / params.chunks"),
+        ("backward_affine_vec4", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 
@@ -108,11 +113,15 @@ fn case(rows: u32, features: u32, accumulate: bool, centred: bool) -> Case {
     let affine = s.random("affine", 2 * width);
     let stats = s.scratch("stats", 2 * rows as usize);
     let [y, d_x] = ["y", "d_x"].map(|name| s.scratch(name, n));
-    let partial = s.scratch("partial", layer_norm_relu::partial_len(rows, features));
+    // Two groups where there are as many rows in both.
+    let groups = if rows.is_multiple_of(2) { 2 } else { 1 };
+    let parts = Parts::of(Rows { groups, rows_per_group: rows / groups, first_group: 0 }, 100);
+    let sums = s.output("sums", layer_norm_relu::sums_len(parts, features), accumulate);
     let d_affine = s.output("d_affine", 2 * width, accumulate);
     let saved = Saved { x, stats, affine, centred };
     s.step(|b| layer_norm_relu::forward(b, rows, features, saved, y));
     s.step(|b| layer_norm_relu::backward_input(b, rows, features, saved, d_y, d_x));
-    s.step(|b| layer_norm_relu::backward_affine(b, rows, features, saved, d_y, partial, d_affine, accumulate));
+    s.step(|b| layer_norm_relu::backward_affine(b, parts, features, saved, d_y, sums, accumulate));
+    s.step(|b| layer_norm_relu::sum_of_parts(b, parts, features, sums, d_affine, accumulate));
     s.finish()
 }

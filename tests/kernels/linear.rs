@@ -1,5 +1,5 @@
-use srn_plan::Rows;
 use srn_plan::ops::linear::{self, Layer, Sets};
+use srn_plan::{Parts, Rows};
 use srn_shaders::{LINEAR_BACKWARD_INPUT, LINEAR_BACKWARD_WEIGHT, LINEAR_FORWARD};
 use srn_tests::{Case, Sketch};
 
@@ -182,11 +182,12 @@ fn backward_input_case(size: Size) -> Case {
     s.finish()
 }
 
-/// The last ones have so many rows that they are summed in chunks.
+/// The last ones have so many rows that they are summed in parts.
 fn backward_weight() -> Vec<Case> {
     let rows = Rows { groups: 2, rows_per_group: 1030, first_group: 1 };
-    let long = |in_features, out_features| Size { rows, in_features, out_features, sets: 4, accumulate: true };
-    sizes().chain([long(5, 3), long(4, 8)]).map(backward_weight_case).collect()
+    let long = |in_features, out_features, sets| Size { rows, in_features, out_features, sets, accumulate: true };
+    let long = [long(5, 3, 4), long(4, 8, 4), long(3, 7, 0), long(12, 4, 0)];
+    sizes().chain(long).map(backward_weight_case).collect()
 }
 
 /// Weights of later images than the first are sums: those of earlier images stay.
@@ -198,12 +199,12 @@ fn backward_weight_case(size: Size) -> Case {
     let d_y = s.random("d_y", (rows.count() * out_features) as usize);
     // The weights themselves take no part.
     let layer = Layer { weights: x, in_features, out_features, sets };
-    let parameters = layer.parameters() as usize;
-    let (written, kept) = if size.sets == 0 { (1, 0) } else { (rows.groups as usize, rows.first_group as usize) };
+    let parts = Parts::of(rows, 500);
+    let sums = s.output("sums", linear::sums_len(parts, layer), accumulate);
+    s.step(|b| linear::backward_weight(b, parts, layer, x, d_y, sums, accumulate));
+    let (written, kept) = if size.sets == 0 { (1, 0) } else { (rows.groups, rows.first_group) };
     let accumulate = accumulate || kept > 0;
-    let d_weights = s.output("d_weights", (kept + written) * parameters, accumulate);
-    let len = linear::partial_len(rows, layer);
-    let partial = if len == 0 { d_weights } else { s.scratch("partial", len) };
-    s.step(|b| linear::backward_weight(b, rows, layer, x, d_y, partial, d_weights, accumulate));
+    let d_weights = s.output("d_weights", ((kept + written) * layer.parameters()) as usize, accumulate);
+    s.step(|b| linear::sum_of_parts(b, parts, layer, sums, d_weights, accumulate));
     s.finish()
 }

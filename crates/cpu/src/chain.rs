@@ -29,6 +29,12 @@ pub fn rows_for_all_threads(features: usize) -> usize {
     block_rows(features) * rayon::current_num_threads()
 }
 
+/// Rows for one sum over a part of the rows of a tile, at most, in a network with layers of `features`: those of a block, as the chain of such
+/// sums has a block for each part.
+pub fn part_rows(tile_rows: usize, features: usize) -> usize {
+    (tile_rows / rayon::current_num_threads()).max(FEWEST_ROWS).min(block_rows(features))
+}
+
 thread_local! {
     static ALONE: Cell<bool> = const { Cell::new(false) };
 }
@@ -45,7 +51,7 @@ pub(crate) fn is_alone() -> bool {
     ALONE.get()
 }
 
-/// Parameters of kernels that make each row of their outputs from the same row of their inputs.
+/// Parameters of kernels that make each row of their outputs from the same row of their inputs, or sums over parts of the rows.
 pub(crate) trait RowWise {
     /// Rows of the step.
     fn rows(&self) -> usize;
@@ -55,7 +61,12 @@ pub(crate) trait RowWise {
         None
     }
 
-    /// Parameters for a part of the rows, of one group.
+    /// Rows of each part of a group, the last one aside, where sums over them are made.
+    fn chunk_rows(&self) -> Option<usize> {
+        None
+    }
+
+    /// Parameters for a block of the rows, of one group; where sums are made, for one part.
     fn block(self, rows: Range<usize>) -> Self;
 }
 
@@ -73,7 +84,7 @@ macro_rules! plain_rows {
     };
 }
 
-plain_rows!(AdvanceParams DensitySumParams LayerNormParams LstmParams);
+plain_rows!(AdvanceParams DensitySumParams LstmParams);
 
 macro_rules! rows_of_groups {
     ($($params:ident: $group_matters:expr;)*) => {
@@ -98,9 +109,58 @@ macro_rules! rows_of_groups {
 // Which group a row belongs to is all the same to a layer with one set of weights: its step has them all as one.
 rows_of_groups! {
     ImageLossParams: |_| true;
-    LinearParams: |p| p.weight_stride > 0;
     PointLayerParams: |p| p.weight_stride > 0;
     RowsParams: |_| true;
+}
+
+impl RowWise for LinearParams {
+    fn rows(&self) -> usize {
+        (self.groups * self.rows_per_group) as usize
+    }
+
+    fn rows_per_group(&self) -> Option<usize> {
+        (self.weight_stride > 0 || self.chunks > 0).then_some(self.rows_per_group as usize)
+    }
+
+    fn chunk_rows(&self) -> Option<usize> {
+        (self.chunks > 0).then_some(self.chunk_rows as usize)
+    }
+
+    fn block(self, rows: Range<usize>) -> Self {
+        let first_group = self.first_group + rows.start as u32 / self.rows_per_group;
+        let rows = rows.len() as u32;
+        Self { groups: 1, rows_per_group: rows, first_group, chunk_rows: rows, chunks: self.chunks.min(1), ..self }
+    }
+}
+
+impl RowWise for LayerNormParams {
+    fn rows(&self) -> usize {
+        self.rows as usize
+    }
+
+    fn rows_per_group(&self) -> Option<usize> {
+        (self.chunks > 0).then_some(self.rows_per_group as usize)
+    }
+
+    fn chunk_rows(&self) -> Option<usize> {
+        (self.chunks > 0).then_some(self.chunk_rows as usize)
+    }
+
+    fn block(self, rows: Range<usize>) -> Self {
+        let rows = rows.len() as u32;
+        Self { rows, rows_per_group: rows, chunk_rows: rows, chunks: self.chunks.min(1), ..self }
+    }
+}
+
+/// What a block of rows has of a buffer.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Share {
+    /// All of it, as every block has.
+    Whole,
+    /// So many values for each of its rows.
+    Row(usize),
+    /// So many values.
+    Block(usize),
 }
 
 /// How a step falls apart into rows.
@@ -110,16 +170,24 @@ pub(crate) struct Split {
     pub rows: usize,
     /// See [`RowWise::rows_per_group`].
     pub rows_per_group: Option<usize>,
-    /// Values of a row in each binding; 0 where all rows read the same.
-    pub widths: Vec<usize>,
+    /// See [`RowWise::chunk_rows`].
+    pub chunk_rows: Option<usize>,
+    /// Of each binding.
+    pub shares: Vec<Share>,
+}
+
+impl Split {
+    /// Of a step with these parameters.
+    pub fn of(params: &impl RowWise, shares: Vec<Share>) -> Self {
+        Split { rows: params.rows(), rows_per_group: params.rows_per_group(), chunk_rows: params.chunk_rows(), shares }
+    }
 }
 
 /// A buffer of a chain.
 #[derive(Debug)]
 pub(crate) struct Place {
     pub buffer: BufferId,
-    /// Values of a row; 0 if every block gets the whole buffer.
-    pub width: usize,
+    pub share: Share,
     pub written: bool,
 }
 
@@ -141,6 +209,7 @@ pub(crate) struct Chain {
     pub blocks: Vec<Range<usize>>,
     rows: usize,
     rows_per_group: Option<usize>,
+    chunk_rows: Option<usize>,
 }
 
 impl Chain {
@@ -156,41 +225,50 @@ impl Chain {
         }
         let threads = rayon::current_num_threads();
         for chain in &mut chains {
-            let values = chain.places.iter().map(|place| place.width).max().unwrap_or(0);
-            chain.blocks = blocks(chain.rows, chain.rows_per_group, values, threads);
+            let values = |place: &Place| if let Share::Row(values) = place.share { values } else { 0 };
+            let widest = chain.places.iter().map(values).max().unwrap_or(0);
+            let group = chain.rows_per_group.unwrap_or(chain.rows).max(1);
+            chain.blocks = match chain.chunk_rows {
+                Some(chunk) => parts(chain.rows, group, chunk),
+                None => blocks(chain.rows, group, widest, threads),
+            };
         }
         chains
     }
 
     fn begin(number: usize, step: &Step, split: Option<Split>) -> Chain {
-        let mut chain =
-            Chain { steps: number..number, links: vec![], places: vec![], blocks: vec![], rows: 0, rows_per_group: None };
-        let whole = Split { rows: 0, rows_per_group: None, widths: vec![0; step.buffers.len()] };
+        let whole = Split { rows: 0, rows_per_group: None, chunk_rows: None, shares: vec![Share::Whole; step.buffers.len()] };
         let split = split.unwrap_or(whole);
-        chain.rows = split.rows;
+        let mut chain = Chain {
+            steps: number..number,
+            links: vec![],
+            places: vec![],
+            blocks: vec![],
+            rows: split.rows,
+            rows_per_group: None,
+            chunk_rows: None,
+        };
         assert!(chain.add(step, &split), "the builder checks that outputs are no inputs");
         chain
     }
 
     /// Takes the step in, unless its blocks would meddle with those of the others.
     fn add(&mut self, step: &Step, split: &Split) -> bool {
-        let groups_agree = match (self.rows_per_group, split.rows_per_group) {
-            (Some(ours), Some(theirs)) => ours == theirs,
-            _ => true,
-        };
-        let bindings = || step.buffers.iter().zip(&split.widths).zip(step.kernel.bindings);
-        let fits = |((&buffer, &width), binding): ((&BufferId, &usize), &srn_shaders::Binding)| {
+        let agree = |ours: Option<usize>, theirs: Option<usize>| ours.zip(theirs).is_none_or(|(ours, theirs)| ours == theirs);
+        let parts_agree = agree(self.rows_per_group, split.rows_per_group) && agree(self.chunk_rows, split.chunk_rows);
+        let bindings = || step.buffers.iter().zip(&split.shares).zip(step.kernel.bindings);
+        let fits = |((&buffer, &share), binding): ((&BufferId, &Share), &srn_shaders::Binding)| {
             let mut known = self.places.iter().filter(|place| place.buffer == buffer);
-            known.all(|known| known.width == width || !known.written && !binding.written)
+            known.all(|known| known.share == share || !known.written && !binding.written)
         };
-        if split.rows != self.rows || !groups_agree || !bindings().all(fits) {
+        if split.rows != self.rows || !parts_agree || !bindings().all(fits) {
             return false;
         }
         let mut link = Link { inputs: vec![], outputs: vec![] };
-        for ((&buffer, &width), binding) in bindings() {
-            let is_it = |place: &Place| place.buffer == buffer && place.width == width;
+        for ((&buffer, &share), binding) in bindings() {
+            let is_it = |place: &Place| place.buffer == buffer && place.share == share;
             let place = self.places.iter().position(is_it).unwrap_or_else(|| {
-                self.places.push(Place { buffer, width, written: false });
+                self.places.push(Place { buffer, share, written: false });
                 self.places.len() - 1
             });
             self.places[place].written |= binding.written;
@@ -199,58 +277,69 @@ impl Chain {
         self.links.push(link);
         self.steps.end += 1;
         self.rows_per_group = self.rows_per_group.or(split.rows_per_group);
+        self.chunk_rows = self.chunk_rows.or(split.chunk_rows);
         true
     }
 }
 
+/// The parts of groups of `group` rows.
+fn parts(rows: usize, group: usize, chunk_rows: usize) -> Vec<Range<usize>> {
+    let of_group =
+        |first: usize| (first..first + group).step_by(chunk_rows).map(move |row| row..(first + group).min(row + chunk_rows));
+    (0..rows).step_by(group).flat_map(of_group).collect()
+}
+
 /// Blocks of `rows` rows with up to `values` values, each of rows of one group; where there are few, as many for each thread.
-fn blocks(rows: usize, rows_per_group: Option<usize>, values: usize, threads: usize) -> Vec<Range<usize>> {
-    let group = rows_per_group.unwrap_or(rows).max(1);
+fn blocks(rows: usize, group: usize, values: usize, threads: usize) -> Vec<Range<usize>> {
     let (groups, whole) = (rows.div_ceil(group), group.div_ceil(block_rows(values)));
     let even = (whole..whole + threads).find(|count| (groups * count).is_multiple_of(threads)).unwrap_or(whole);
     let few = groups * whole < FEW_BLOCKS * threads;
     let count = if few { even.min(group / FEWEST_ROWS).max(whole) } else { whole };
-    let of_group = |first: usize| {
-        let step = group.div_ceil(count);
-        (first..first + group).step_by(step).map(move |row| row..(first + group).min(row + step))
-    };
-    (0..rows).step_by(group).flat_map(of_group).collect()
+    parts(rows, group, group.div_ceil(count))
 }
 
 #[cfg(test)]
 mod tests {
     use srn_plan::ops::linear::{self, Layer, Sets};
-    use srn_plan::{Builder, Rows};
+    use srn_plan::{Builder, Parts, Rows};
 
     use super::*;
+    use crate::executor::split;
 
     /// Rows of the blocks on two threads.
     fn lengths(rows: usize, rows_per_group: Option<usize>, values: usize) -> Vec<usize> {
-        let blocks = blocks(rows, rows_per_group, values, 2);
+        let blocks = blocks(rows, rows_per_group.unwrap_or(rows).max(1), values, 2);
         assert!(blocks.windows(2).all(|pair| pair[0].end == pair[1].start), "in order, no row twice");
         assert_eq!(blocks.iter().map(ExactSizeIterator::len).sum::<usize>(), rows, "all rows");
         blocks.iter().map(ExactSizeIterator::len).collect()
     }
 
     #[test]
-    fn layers_with_one_set_of_weights_belong_to_a_chain_of_groups() {
+    fn layers_and_sums_for_their_weights_belong_to_a_chain_of_groups() {
         let mut b = Builder::new(u64::MAX);
         let rows = Rows { groups: 3, rows_per_group: 256, first_group: 0 };
-        let sizes = [("x", 768 * 4), ("y", 768 * 4), ("z", 768 * 4), ("weights", 60), ("shared", 20)];
-        let [x, y, z, weights, shared] = sizes.map(|(name, len)| b.input(name, len).unwrap());
+        let sizes = [("x", 768 * 4), ("y", 768 * 4), ("z", 768 * 4), ("weights", 60), ("shared", 20), ("sums", 9 * 20)];
+        let [x, y, z, weights, shared, sums] = sizes.map(|(name, len)| b.input(name, len).unwrap());
         let slots = b.input_u32("slots", 3).unwrap();
         let layer = |weights, sets| Layer { in_features: 4, out_features: 4, weights, sets };
+        let of_groups = layer(weights, Sets::Slots { count: 3 });
+        let of_all = layer(shared, Sets::Shared);
+        let parts = Parts::of(rows, 100);
         b.stage("layers");
-        linear::forward(&mut b, rows, layer(weights, Sets::Slots { count: 3 }), x, slots, y, false).unwrap();
-        linear::forward(&mut b, rows, layer(shared, Sets::Shared), y, slots, z, false).unwrap();
+        linear::forward(&mut b, rows, of_groups, x, slots, y, false).unwrap();
+        linear::forward(&mut b, rows, of_all, y, slots, z, false).unwrap();
+        b.stage("layers and sums");
+        linear::forward(&mut b, rows, of_groups, x, slots, y, false).unwrap();
+        linear::backward_weight(&mut b, parts, of_all, x, y, sums, false).unwrap();
+        linear::backward_weight(&mut b, parts, of_groups, x, y, sums, true).unwrap();
         let plan = b.finish().unwrap();
-        let split = |step: &Step| {
-            let p: LinearParams = step.params();
-            Some(Split { rows: p.rows(), rows_per_group: p.rows_per_group(), widths: vec![4, 0, 0, 4] })
-        };
-        let chains = Chain::of(&plan.stages[0].steps, split);
-        assert_eq!(chains.len(), 1);
-        assert!(chains[0].blocks.iter().all(|block| block.start / 256 == (block.end - 1) / 256), "{:?}", chains[0].blocks);
+        let chains = plan.stages.iter().map(|stage| Chain::of(&stage.steps, split)).collect::<Vec<_>>();
+        assert_eq!(chains.iter().map(Vec::len).collect::<Vec<_>>(), [1, 1]);
+        for block in chains.iter().flat_map(|chains| &chains[0].blocks) {
+            assert_eq!(block.start / 256, (block.end - 1) / 256, "{block:?}");
+        }
+        let lengths = chains[1][0].blocks.iter().map(ExactSizeIterator::len).collect::<Vec<_>>();
+        assert_eq!(lengths, [86, 86, 84, 86, 86, 84, 86, 86, 84], "the parts");
     }
 
     #[test]

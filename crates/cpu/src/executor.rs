@@ -6,7 +6,7 @@ use srn_shaders::{
     AdvanceParams, DensitySumParams, ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams, RowsParams,
 };
 
-use crate::chain::{Chain, Link, RowWise, Split};
+use crate::chain::{Chain, Link, RowWise, Share, Split};
 use crate::{Real, chain, hidden_layer, ops};
 
 /// The values of one buffer.
@@ -204,14 +204,17 @@ impl<T: Real> CpuExecutor<T> {
                 true => written.next().expect("one is taken for each").whole_mut(),
                 false => buffers[place.buffer.index()].whole(),
             };
-            if place.width > 0 {
-                for (block, rows) in blocks.iter_mut().zip(&chain.blocks) {
-                    block.push(rest.split_off(place.width * rows.len()));
+            match place.share {
+                Share::Whole => {
+                    let (last, others) = blocks.split_last_mut().expect("there is at least one");
+                    others.iter_mut().for_each(|block| block.push(rest.again()));
+                    last.push(rest);
                 }
-            } else {
-                let (last, others) = blocks.split_last_mut().expect("there is at least one");
-                others.iter_mut().for_each(|block| block.push(rest.again()));
-                last.push(rest);
+                Share::Row(values) => {
+                    let rows = chain.blocks.iter().map(ExactSizeIterator::len);
+                    blocks.iter_mut().zip(rows).for_each(|(block, rows)| block.push(rest.split_off(values * rows)));
+                }
+                Share::Block(values) => blocks.iter_mut().for_each(|block| block.push(rest.split_off(values))),
             }
         }
         let run = |(number, mut parts): (usize, Vec<Part<T>>)| {
@@ -366,11 +369,12 @@ fn both_of_a_layer<T: Real>(steps: &[Step], rows: &Range<usize>, parts: &mut [Pa
 const OUTPUTS: usize = 3;
 
 /// Lists the references once: `op/direction` with the element types of inputs and outputs, in the order of the bindings. Those of `rows`
-/// make each row from the same row of what they read; with the values of a row in each binding, 0 where all rows read the same.
+/// make each row from the same row of what they read, or sums over each part of the rows; with the values of a row in each binding, 0 where
+/// all rows read the same, and those of a sum.
 macro_rules! references {
     (
         rows { $($row:literal => $row_op:ident::$row_direction:ident($($row_input:ident)*) -> ($($row_output:ident)*),
-            |$p:ident: $params:ty| $widths:expr;)* }
+            |$p:ident: $params:ty| $widths:expr $(, sum of $sum:expr)?;)* }
         whole { $($name:literal => $op:ident::$direction:ident($($input:ident)*) -> ($($output:ident)*);)* }
     ) => {
         /// Runs a step on a block of rows, or as a whole.
@@ -400,13 +404,14 @@ macro_rules! references {
         }
 
         /// How a step falls apart, if it does.
-        fn split(step: &Step) -> Option<Split> {
+        pub(crate) fn split(step: &Step) -> Option<Split> {
             match step.kernel.name {
                 $($row => {
                     let $p: $params = step.params();
                     let widths: &[u32] = &$widths;
-                    let widths = widths.iter().map(|&width| width as usize).collect();
-                    Some(Split { rows: $p.rows(), rows_per_group: $p.rows_per_group(), widths })
+                    let share = |&width: &u32| if width == 0 { Share::Whole } else { Share::Row(width as usize) };
+                    let shares = widths.iter().map(share)$(.chain([Share::Block($sum as usize)]))?.collect();
+                    Some(Split::of(&$p, shares))
                 })*
                 _ => None,
             }
@@ -422,10 +427,14 @@ references! {
         "rays/forward" => rays::forward(f f f f) -> (f_mut f_mut), |_p: RowsParams| [0, 0, 2, 1, 3, 3];
         "linear/forward" => linear::forward(f f u) -> (f_mut), |p: LinearParams| [p.in_features, 0, 0, p.out_features];
         "linear/backward_input" => linear::backward_input(f f u) -> (f_mut), |p: LinearParams| [p.out_features, 0, 0, p.in_features];
+        "linear/backward_weight" => linear::backward_weight(f f) -> (f_mut), |p: LinearParams| [p.in_features, p.out_features],
+            sum of p.out_features * (p.in_features + 1);
         "layer_norm_relu/forward" => layer_norm_relu::forward(f f) -> (f_mut f_mut),
             |p: LayerNormParams| [p.features, 0, p.features, 2];
         "layer_norm_relu/backward_input" => layer_norm_relu::backward_input(f f f f) -> (f_mut),
             |p: LayerNormParams| [p.features, 2, 0, p.features, p.features];
+        "layer_norm_relu/backward_affine" => layer_norm_relu::backward_affine(f f f f) -> (f_mut),
+            |p: LayerNormParams| [p.features, 2, 0, p.features], sum of 2 * p.features;
         "point_layer/forward" => point_layer::forward(f f u f) -> (f_mut), |p: PointLayerParams| [3, 0, 0, 0, p.features];
         "point_layer/backward_input" => point_layer::backward_input(f f u f f) -> (f_mut),
             |p: PointLayerParams| [3, 0, 0, 0, p.features, 3];
@@ -450,8 +459,6 @@ references! {
         "tile/scatter" => tile::scatter(f) -> (f_mut);
         "embedding/forward" => embedding::forward(f u) -> (f_mut);
         "embedding/backward" => embedding::backward(u f) -> (f_mut);
-        "linear/backward_weight" => linear::backward_weight(f f) -> (f_mut);
-        "layer_norm_relu/backward_affine" => layer_norm_relu::backward_affine(f f f f) -> (f_mut);
         "depth_loss/forward" => depth_loss::forward(f) -> (f_mut);
         "latent_loss/forward" => latent_loss::forward(f) -> (f_mut);
         "latent_loss/backward" => latent_loss::backward(f) -> (f_mut);

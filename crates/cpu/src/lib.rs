@@ -12,6 +12,6 @@ pub mod ops;
 mod real;
 mod simd;
 
-pub use chain::rows_for_all_threads;
+pub use chain::{part_rows, rows_for_all_threads};
 pub use executor::CpuExecutor;
 pub use real::Real;

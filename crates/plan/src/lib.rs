@@ -14,7 +14,7 @@ mod rows;
 pub use builder::{Access, Arg, Builder};
 pub use error::{ExecutorError, PlanError};
 pub use executor::Executor;
-pub use rows::{Rows, Tile, tiles};
+pub use rows::{Parts, Rows, Tile, tiles};
 pub use srn_shaders::{Element, Kernel};
 
 /// Names a buffer of one plan.

@@ -21,6 +21,36 @@ impl Rows {
     }
 }
 
+/// The rows of each group cut into parts, as even as possible: a sum over rows goes over each part first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Parts {
+    /// The rows.
+    pub rows: Rows,
+    /// Rows of a part; the last one of each group may have fewer.
+    pub chunk_rows: u32,
+    /// Parts of each group.
+    pub chunks: u32,
+}
+
+impl Parts {
+    /// Parts of at most `most` rows.
+    pub fn of(rows: Rows, most: u32) -> Self {
+        let fewest = rows.rows_per_group.div_ceil(most.max(1)).max(1);
+        let chunk_rows = rows.rows_per_group.div_ceil(fewest).max(1);
+        Parts { rows, chunk_rows, chunks: rows.rows_per_group.div_ceil(chunk_rows).max(1) }
+    }
+
+    /// One part for each group.
+    pub fn whole(rows: Rows) -> Self {
+        Parts::of(rows, rows.rows_per_group)
+    }
+
+    /// Number of parts.
+    pub fn count(self) -> u32 {
+        self.rows.groups * self.chunks
+    }
+}
+
 /// A part of a batch of images that is computed at once: some whole images, or a part of one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tile {
@@ -61,6 +91,24 @@ fn even_parts(count: u32, most: u32) -> impl Iterator<Item = (u32, u32)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn parts_are_even_and_no_longer_than_asked_for() {
+        for (rows_per_group, most, expected) in [
+            (256, 256, [256, 1]),
+            (300, 256, [150, 2]),
+            (4096, 1024, [1024, 4]),
+            (5, 4, [3, 2]),
+            (9, 4, [3, 3]),
+            (7, 100, [7, 1]),
+        ] {
+            let parts = Parts::of(Rows { groups: 3, rows_per_group, first_group: 2 }, most);
+            assert_eq!([parts.chunk_rows, parts.chunks], expected);
+            assert_eq!(parts.count(), 3 * expected[1]);
+            assert!((parts.chunks - 1) * parts.chunk_rows < rows_per_group && rows_per_group <= parts.chunks * parts.chunk_rows);
+        }
+        assert_eq!(Parts::whole(Rows::plain(70_000)).count(), 1);
+    }
 
     #[test]
     fn tiles_cover_every_row_once() {

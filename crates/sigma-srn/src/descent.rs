@@ -12,7 +12,7 @@ use crate::engine::{Engine, Runner};
 use crate::model::Model;
 use crate::network::forward::{self, Instances};
 use crate::network::streamed::OnHost;
-use crate::network::{Batch, Network, Purpose, Saved, Scratch, Started, Trainable, backward};
+use crate::network::{Batch, Network, Purpose, Saved, Scratch, Started, Sums, Trainable, backward};
 use crate::rays::wanted;
 use crate::{Error, Rays};
 
@@ -128,9 +128,8 @@ impl Descent {
         }
         let rows = hypotheses * width * height;
         let on_host = OnHost::of(engine, model, 1);
-        let (plan, mut handles) = engine.fit(rows, model.layout.features(), Purpose::Pose, |b, tile_rows| {
-            build(b, model, shape, method, tile_rows, &on_host)
-        })?;
+        let (plan, mut handles) =
+            engine.fit(rows, model.layout.features(), |b, tile_rows| build(b, model, shape, method, tile_rows, &on_host))?;
         let mut runner = engine.prepare(plan)?;
         handles.instances.upload(&mut *runner, &handles.network, model)?;
         if let Moves::Bfgs { seeds, .. } = handles.moves {
@@ -348,7 +347,7 @@ fn build(
     let cut = tiles(hypotheses, rays_per_image, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
     let saved = Saved::new(b, &network, Purpose::Pose, most)?;
-    let scratch = Scratch::new(b, &network, &saved)?;
+    let scratch = Scratch::new(b, &network, &saved, Sums::default())?;
     let gmsd = matches!(method, Method::Adam { loss: Loss::Gmsd, .. });
     let target = b.input("target", if gmsd { 3 } else { 4 } * hypotheses as usize * rays_per_image as usize)?;
 
@@ -358,7 +357,7 @@ fn build(
         Method::Adam { loss, .. } => loss.per_pixel(),
         Method::Bfgs { soft } => Some(image_loss::Kind::Charbonnier { soft }),
     };
-    let comparison = Comparison::new(b, &network, &cut, shape, loss)?;
+    let comparison = Comparison::new(b, &cut, shape, loss)?;
     let parts = Parts { network: &network, saved: &saved, scratch: &scratch, target, cut: &cut, comparison: &comparison, shape };
 
     let targets = b.stage("targets");
@@ -397,17 +396,11 @@ enum Kind {
 }
 
 impl Comparison {
-    fn new(
-        b: &mut Builder,
-        network: &Network,
-        cut: &[Tile],
-        shape: Shape,
-        loss: Option<image_loss::Kind>,
-    ) -> Result<Self, PlanError> {
+    fn new(b: &mut Builder, cut: &[Tile], shape: Shape, loss: Option<image_loss::Kind>) -> Result<Self, PlanError> {
         let Shape { hypotheses, width, height, .. } = shape;
         let (n, most) = (hypotheses as usize, cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1) as usize);
         let images = gmsd::Images { count: hypotheses, width, height };
-        let of_tile = |tile: &Tile| backward::partial_len(network, tile.rows).max(bfgs::partial_len(tile.rows));
+        let of_tile = |tile: &Tile| rays::partial_len(tile.rows).max(bfgs::partial_len(tile.rows));
         let of_images = image_loss::partial_len(hypotheses, width * height).max(images.partial_len());
         let partial = b.scratch("partial sums", cut.iter().map(of_tile).max().unwrap_or(1).max(of_images))?;
         let kind = match loss {
@@ -507,7 +500,7 @@ impl Parts<'_> {
                     tile_ops::gather(b, tile, 3, d_rgb, tile_d_rgb)?;
                 }
             }
-            backward::render(b, network, saved, scratch, partial, tile, tile_d_rgb, false, &mut started)?;
+            backward::render(b, network, saved, scratch, tile, tile_d_rgb, false, &mut started)?;
             let accumulate = started.accumulate(d_matrix, tile.rows.first_group);
             let pixels = network.pixels(saved);
             rays::backward(b, tile.rows, pixels, scratch.d_origin, scratch.d_direction, partial, d_matrix, accumulate)?;
@@ -573,7 +566,7 @@ impl Parts<'_> {
             forward::render(b, network, saved, tile)?;
             tile_ops::gather(b, tile, 4, target, tile_target)?;
             for (number, d_rgb) in (0..).zip(seeds) {
-                backward::render(b, network, saved, scratch, partial, tile, d_rgb, false, &mut started)?;
+                backward::render(b, network, saved, scratch, tile, d_rgb, false, &mut started)?;
                 let channel = Channel { number, seed: SEED, scale, soft };
                 let accumulate = started.accumulate(equations, tile.rows.first_group);
                 bfgs::equations(b, tile.rows, residuals, channel, partial, equations, accumulate)?;

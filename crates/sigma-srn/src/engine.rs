@@ -8,17 +8,16 @@ use srn_plan::ops::linear::{self, Layer, Sets};
 use srn_plan::{Builder, Executor, ExecutorError, Plan, PlanError, Rows};
 
 use crate::Error;
-use crate::network::Purpose;
 
 /// Memory that a plan may take on the CPU where the user sets no budget, in bytes.
 const CPU_BUDGET: u64 = 2 << 30;
-/// Values of one layer of a tile on the CPU where gradients of weights are summed over its rows: large enough for the sums, small enough for
-/// the caches.
-const TRAINING_TILE_VALUES: u32 = 1 << 18;
 /// Rows of a tile on a GPU: enough to fill a large one.
 const GPU_TILE_ROWS: u32 = 32_768;
 /// The same for a software adapter.
 const SOFTWARE_TILE_ROWS: u32 = 4096;
+
+/// Rows of a sum: enough for one invocation.
+const GPU_PART_ROWS: u32 = 1024;
 
 /// What computes.
 #[derive(Clone, Debug)]
@@ -125,18 +124,13 @@ impl Engine {
         &self,
         rows: u32,
         features: u32,
-        purpose: Purpose,
         build: impl Fn(&mut Builder, u32) -> Result<T, PlanError>,
     ) -> Result<(Plan, T), Error> {
-        let for_all_threads = srn_cpu::rows_for_all_threads(features as usize) as u32;
         let preferred = self.tile_rows.unwrap_or(match &self.kind {
             Kind::Gpu(gpu) if gpu.adapter().is_software => SOFTWARE_TILE_ROWS,
             Kind::Gpu(_) => GPU_TILE_ROWS,
-            Kind::Cpu | Kind::CpuF64 if purpose == Purpose::Train => {
-                (TRAINING_TILE_VALUES / features.max(1)).max(2 * for_all_threads)
-            }
             // What is kept for the way back stays in the caches.
-            Kind::Cpu | Kind::CpuF64 => for_all_threads,
+            Kind::Cpu | Kind::CpuF64 => srn_cpu::rows_for_all_threads(features as usize) as u32,
         });
         let mut tile_rows = rows.min(preferred).max(1);
         loop {
@@ -152,6 +146,14 @@ impl Engine {
                 return Err(Error::Budget { budget: self.budget, needed });
             }
             tile_rows = (tile_rows * 3 / 4).max(1);
+        }
+    }
+
+    /// Rows of a tile of `tile_rows` over which one sum for the gradients of weights goes, at most, for a network of `features` wide layers.
+    pub(crate) fn part_rows(&self, tile_rows: u32, features: u32) -> u32 {
+        match self.kind {
+            Kind::Gpu(_) => GPU_PART_ROWS,
+            Kind::Cpu | Kind::CpuF64 => srn_cpu::part_rows(tile_rows as usize, features as usize) as u32,
         }
     }
 

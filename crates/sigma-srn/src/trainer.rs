@@ -5,13 +5,13 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use srn_plan::ops::{adam, depth, depth_loss, image_loss, latent_loss, tile as tile_ops};
-use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, tiles};
+use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, Tile, tiles};
 
 use crate::engine::{Engine, Runner};
 use crate::model::{Model, Tensors, read_tensors, write_tensors};
 use crate::network::backward::{self, HyperScratch};
 use crate::network::streamed::{OnHost, Streamed};
-use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, SourceBuffers, Started, Trainable, forward};
+use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, SourceBuffers, Started, Sums, Trainable, forward};
 use crate::rays::wanted;
 use crate::{Error, Rays};
 
@@ -107,8 +107,10 @@ impl Trainer {
         let features = model.layout.features();
         // Value, gradient and two moments.
         let on_host = OnHost::of(engine, &model, if train == Train::Everything { 4 } else { 1 });
-        let (plan, handles) = engine
-            .fit(images * rays, features, Purpose::Train, |b, tile_rows| build(b, &model, train, batch, tile_rows, &on_host))?;
+        let (plan, handles) = engine.fit(images * rays, features, |b, tile_rows| {
+            let cut = tiles(images, rays, tile_rows);
+            build(b, &model, train, batch, &cut, engine.part_rows(tile_rows, features), &on_host)
+        })?;
         let mut runner = engine.prepare(plan)?;
         handles.network.upload(&mut *runner, &model)?;
         let slots: Vec<u32> = (0..images).collect();
@@ -297,7 +299,8 @@ fn build(
     model: &Model,
     train: Train,
     batch: Batch,
-    tile_rows: u32,
+    cut: &[Tile],
+    part_rows: u32,
     on_host: &OnHost,
 ) -> Result<Handles, PlanError> {
     let trainable = if train == Train::Codes { Trainable::Codes } else { Trainable::Everything };
@@ -305,19 +308,17 @@ fn build(
     let mut streamed = Streamed::new(b, model, batch, on_host, train == Train::Everything)?;
     let (images, rays) = (batch.images, batch.rays);
     let rows = images * rays;
-    let cut = tiles(images, rays, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
     let saved = Saved::new(b, &network, Purpose::Train, most)?;
-    let scratch = Scratch::new(b, &network, &saved)?;
+    let sums = Sums::new(b, &network, cut, part_rows)?;
+    let scratch = Scratch::new(b, &network, &saved, sums)?;
     let SourceBuffers::Hypernetwork(hyper) = &network.source else { unreachable!("a trainer takes no baked model") };
     let hyper_saved = HyperSaved::new(b, &network, hyper)?;
     let hyper_scratch = HyperScratch::new(b, &network, hyper)?;
     let codes_count = batch.slots * hyper.latent;
-    let partial_len = cut.iter().map(|tile| backward::partial_len(&network, tile.rows)).max().unwrap_or(1);
-    let sums =
+    let of_losses =
         image_loss::partial_len(images, rays).max(depth_loss::partial_len(rows)).max(latent_loss::partial_len(codes_count));
-    let of_streamed = streamed.as_ref().map_or(0, |streamed| streamed.partial_len(&network));
-    let partial = b.scratch("partial sums", partial_len.max(sums).max(of_streamed))?;
+    let partial = b.scratch("partial sums", of_losses)?;
     let target = b.input("target", 4 * rows as usize)?;
     let tile_target = b.scratch("tile target", 4 * most as usize)?;
     let d_rgb = b.scratch("tile d rgb", 3 * most as usize)?;
@@ -333,21 +334,21 @@ fn build(
     }
 
     let render = b.stage("render and back");
-    for &tile in &cut {
+    for &tile in cut {
         forward::render(b, &network, &saved, tile)?;
         tile_ops::gather(b, tile, 4, target, tile_target)?;
         let scale = (IMAGE_WEIGHT / f64::from(images)) as f32;
         image_loss::backward(b, image_loss::Kind::Mse, tile.rows, rays, scale, saved.rgb(), tile_target, count, d_rgb)?;
         let scale = (DEPTH_WEIGHT / f64::from(rows)) as f32;
         depth::backward(b, tile.rows, scale, network.world_from_camera, saved.depth, scratch.d_origin)?;
-        backward::render(b, &network, &saved, &scratch, partial, tile, d_rgb, true, &mut started)?;
+        backward::render(b, &network, &saved, &scratch, tile, d_rgb, true, &mut started)?;
     }
     if let Some(streamed) = &mut streamed {
         streamed.backward(b, &network, &hyper_scratch, &mut started)?;
     }
 
     let after = b.stage("hypernetwork back");
-    backward::hypernetwork(b, &network, hyper, &hyper_saved, &hyper_scratch, partial, &mut started)?;
+    backward::hypernetwork(b, &network, hyper, &hyper_saved, &hyper_scratch, &mut started)?;
     let scale = (LATENT_WEIGHT / f64::from(codes_count)) as f32;
     latent_loss::backward(b, codes_count, scale, hyper_saved.z, hyper_scratch.d_z)?;
     backward::codes(b, &network, hyper, hyper_scratch.d_z)?;
@@ -366,7 +367,7 @@ fn build(
         moments.push((number, [m, v]));
     }
     if let Some(streamed) = &mut streamed {
-        streamed.update(b, &network, &hyper_saved, partial, schedule)?;
+        streamed.update(b, &network, &hyper_saved, schedule)?;
     }
     Ok(Handles {
         network,

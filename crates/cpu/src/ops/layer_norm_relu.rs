@@ -1,10 +1,8 @@
 //! `y = relu(gamma x̂ + beta)`, `x̂ = (x - mean) rstd`, `rstd = 1/√(var + 1e-5)`. Where `x` is centred, `mean` is 0, and `mean(e)` counts as 0.
 
 use pulp::{Arch, Simd, WithSimd};
-use rayon::prelude::*;
 use srn_shaders::LayerNormParams;
 
-use super::chunk_of;
 use crate::Real;
 use crate::simd::{sum, vectorised};
 
@@ -206,18 +204,20 @@ impl<const CENTRED: bool> Rows for Backward<'_, CENTRED> {
     }
 }
 
-/// Per chunk of rows: sums of `d_y x̂` and of `d_y`, where `y > 0`.
+/// Per group and chunk of rows: sums of `d_y x̂` and of `d_y`, where `y > 0`.
 pub fn backward_affine<T: Real>(p: LayerNormParams, x: &[T], stats: &[T], affine: &[T], d_y: &[T], partial: &mut [T]) {
-    let width = p.features as usize;
-    partial[..2 * width * p.chunks as usize].par_chunks_mut(2 * width).enumerate().for_each(|(chunk, partial)| {
-        let rows = chunk_of(chunk, p.chunk_rows, p.rows);
-        let values = rows.start * width..rows.end * width;
-        affine_rows(&x[values.clone()], &stats[2 * rows.start..2 * rows.end], affine, &d_y[values], partial);
-    });
+    let [rows, width, of_group, chunk] = [p.rows, p.features, p.rows_per_group, p.chunk_rows].map(|size| size as usize);
+    let firsts =
+        (0..rows).step_by(of_group).flat_map(|group| (group..group + of_group).step_by(chunk).map(move |row| (group, row)));
+    for ((group, first), partial) in firsts.zip(partial.chunks_exact_mut(2 * width)) {
+        let end = (first + chunk).min(group + of_group);
+        let values = first * width..end * width;
+        affine_rows(p.accumulate == 1, &x[values.clone()], &stats[2 * first..2 * end], affine, &d_y[values], partial);
+    }
 }
 
 vectorised! {
-    fn affine_rows<T: Real>(x: &[T], stats: &[T], affine: &[T], d_y: &[T], partial: &mut [T]) {
+    fn affine_rows<T: Real>(accumulate: bool, x: &[T], stats: &[T], affine: &[T], d_y: &[T], partial: &mut [T]) {
         let width = affine.len() / 2;
         let (gamma, beta) = affine.split_at(width);
         let (mut d_gamma, mut d_beta) = (vec![0.0; width], vec![0.0; width]);
@@ -231,7 +231,7 @@ vectorised! {
             }
         }
         for (partial, &sum) in partial.iter_mut().zip(d_gamma.iter().chain(&d_beta)) {
-            *partial = T::of(sum);
+            *partial = T::of(sum + if accumulate { partial.wide() } else { 0.0 });
         }
     }
 }

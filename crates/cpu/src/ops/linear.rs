@@ -1,10 +1,9 @@
 //! Linear layers: wide ones through a matrix library, narrow ones through `narrow.rs`.
 
 use gemm::{Parallelism, gemm};
-use rayon::prelude::*;
 use srn_shaders::LinearParams;
 
-use super::{chunk_of, set_of};
+use super::set_of;
 use crate::Real;
 use crate::chain::is_alone;
 use crate::narrow::{self, Begin, Weights};
@@ -157,30 +156,22 @@ pub fn backward_input<T: Real>(p: LinearParams, d_y: &[T], weights: &[T], slots:
 
 /// Per group and chunk of rows: `d_yᵀ x`, then the column sums of `d_y`.
 pub fn backward_weight<T: Real>(p: LinearParams, x: &[T], d_y: &[T], partial: &mut [T]) {
-    let [ins, outs] = [p.in_features as usize, p.out_features as usize];
-    let parameters = outs * ins + outs;
-    let parts = (p.groups * p.chunks) as usize;
-    let work = |part: usize, out: &mut [T], threads: Parallelism| {
-        let (group, chunk) = (part / p.chunks as usize, part % p.chunks as usize);
-        let rows = chunk_of(chunk, p.chunk_rows, p.rows_per_group);
-        let first = group * p.rows_per_group as usize;
-        let rows = first + rows.start..first + rows.end;
-        let (d_weight, d_bias) = out.split_at_mut(outs * ins);
-        let d_y = &d_y[rows.start * outs..rows.end * outs];
-        let x = &x[rows.start * ins..rows.end * ins];
-        let size = [outs, ins, rows.len()];
-        product(size, d_weight, Matrix(d_y, [1, outs]), Matrix(x, [ins, 1]), p.accumulate == 1, threads);
-        let mut sums = vec![0.0; outs];
-        add_rows(d_y, &mut sums);
-        for (d_bias, sum) in d_bias.iter_mut().zip(sums) {
-            *d_bias = T::of(sum + if p.accumulate == 1 { d_bias.wide() } else { 0.0 });
+    let [ins, outs, rows, chunk] = [p.in_features, p.out_features, p.rows_per_group, p.chunk_rows].map(|size| size as usize);
+    let accumulate = p.accumulate == 1;
+    let mut partial = partial.chunks_exact_mut(outs * ins + outs);
+    let groups = x.chunks_exact(rows * ins).zip(d_y.chunks_exact(rows * outs));
+    for (x, d_y) in groups.take(p.groups as usize) {
+        for ((x, d_y), partial) in x.chunks(chunk * ins).zip(d_y.chunks(chunk * outs)).zip(&mut partial) {
+            let (d_weight, d_bias) = partial.split_at_mut(outs * ins);
+            let size = [outs, ins, x.len() / ins];
+            product(size, d_weight, Matrix(d_y, [1, outs]), Matrix(x, [ins, 1]), accumulate, threads());
+            let mut sums = vec![0.0; outs];
+            add_rows(d_y, &mut sums);
+            for (d_bias, sum) in d_bias.iter_mut().zip(sums) {
+                *d_bias = T::of(sum + if accumulate { d_bias.wide() } else { 0.0 });
+            }
         }
-    };
-    let partial = &mut partial[..parts * parameters];
-    if parts == 1 {
-        return work(0, partial, Parallelism::Rayon(0));
     }
-    partial.par_chunks_mut(parameters).enumerate().for_each(|(part, out)| work(part, out, Parallelism::None));
 }
 
 vectorised! {

@@ -2,11 +2,8 @@
 
 use srn_shaders::{LAYER_NORM_RELU_BACKWARD_AFFINE, LAYER_NORM_RELU_BACKWARD_INPUT, LAYER_NORM_RELU_FORWARD, LayerNormParams};
 
-use super::{overwrite, read, size, sum};
-use crate::{BufferId, Builder, PlanError};
-
-/// Rows per partial sum of [`backward_affine`].
-const CHUNK_ROWS: u32 = 256;
+use super::{output, overwrite, read, size, sum};
+use crate::{BufferId, Builder, Parts, PlanError};
 
 /// What [`forward`] saved for the way back.
 #[derive(Clone, Copy, Debug)]
@@ -50,34 +47,47 @@ pub fn backward_input(
     b.step(&LAYER_NORM_RELU_BACKWARD_INPUT, params(rows, features, saved), &args, [rows, 1, 1], 2 * u64::from(features), 0)
 }
 
-/// Length of the partial sums of [`backward_affine`].
-pub fn partial_len(rows: u32, features: u32) -> usize {
-    size([rows.div_ceil(CHUNK_ROWS), 2, features])
+/// Length of the sums of [`backward_affine`].
+pub fn sums_len(parts: Parts, features: u32) -> usize {
+    size([parts.count(), 2, features])
 }
 
-/// `d_affine [2, features] (+)=` sums over the rows, by way of `partial`.
+/// Gradient of gamma and beta over each part of the rows, `sums [groups · chunks, 2, features]`; where all rows are one part, that is the
+/// gradient.
 pub fn backward_affine(
     b: &mut Builder,
-    rows: u32,
+    parts: Parts,
     features: u32,
     saved: Saved,
     d_y: BufferId,
-    partial: BufferId,
+    sums: BufferId,
+    accumulate: bool,
+) -> Result<(), PlanError> {
+    let Parts { rows, chunk_rows, chunks } = parts;
+    let n = size([rows.count(), features]);
+    let args = [
+        read(saved.x, n),
+        read(saved.stats, size([rows.count(), 2])),
+        read(saved.affine, size([2, features])),
+        read(d_y, n),
+        output(sums, sums_len(parts, features), accumulate),
+    ];
+    let rows_per_group = rows.rows_per_group;
+    let params = params(rows.count(), features, saved);
+    let params = LayerNormParams { rows_per_group, chunk_rows, chunks, accumulate: accumulate.into(), ..params };
+    b.step(&LAYER_NORM_RELU_BACKWARD_AFFINE, params, &args, [features, parts.count(), 1], chunk_rows.into(), 0)
+}
+
+/// From the sums of [`backward_affine`] to the gradient, `d_affine [2, features]`.
+pub fn sum_of_parts(
+    b: &mut Builder,
+    parts: Parts,
+    features: u32,
+    sums: BufferId,
     d_affine: BufferId,
     accumulate: bool,
 ) -> Result<(), PlanError> {
-    let n = size([rows, features]);
-    let chunks = rows.div_ceil(CHUNK_ROWS);
-    let args = [
-        read(saved.x, n),
-        read(saved.stats, size([rows, 2])),
-        read(saved.affine, size([2, features])),
-        read(d_y, n),
-        overwrite(partial, partial_len(rows, features)),
-    ];
-    let params = LayerNormParams { chunk_rows: CHUNK_ROWS, chunks, ..params(rows, features, saved) };
-    b.step(&LAYER_NORM_RELU_BACKWARD_AFFINE, params, &args, [features, chunks, 1], CHUNK_ROWS.into(), 0)?;
-    sum::forward(b, sum::Groups::ONE, chunks, 2 * features, partial, d_affine, accumulate)
+    sum::forward(b, sum::Groups::ONE, parts.count(), 2 * features, sums, d_affine, accumulate)
 }
 
 fn params(rows: u32, features: u32, saved: Saved) -> LayerNormParams {

@@ -2,11 +2,9 @@
 
 use srn_shaders::{LINEAR_BACKWARD_INPUT, LINEAR_BACKWARD_WEIGHT, LINEAR_FORWARD, LinearParams};
 
-use super::{output, overwrite, read, size, sum};
-use crate::{BufferId, Builder, PlanError, Rows};
+use super::{output, read, size, sum};
+use crate::{BufferId, Builder, Parts, PlanError, Rows};
 
-/// Rows per partial sum of [`backward_weight`].
-const CHUNK_ROWS: u32 = 1024;
 /// Output features per dispatch of [`backward_input`]: bounds the loop of one invocation.
 const MOST_OUT: u32 = 16_384;
 
@@ -138,45 +136,45 @@ pub fn backward_input(
     Ok(())
 }
 
-/// Whether [`backward_weight`] needs no partial sums: so few rows that one invocation sums over all, and the sets from the first on.
-fn is_direct(rows: Rows) -> bool {
-    rows.rows_per_group <= CHUNK_ROWS && rows.first_group == 0
+/// Length of the sums of [`backward_weight`].
+pub fn sums_len(parts: Parts, layer: Layer) -> usize {
+    size([parts.count(), layer.parameters()])
 }
 
-/// Length of the partial sums of [`backward_weight`].
-pub fn partial_len(rows: Rows, layer: Layer) -> usize {
-    let rows = layer.rows(rows);
-    if is_direct(rows) { 0 } else { size([rows.groups, rows.rows_per_group.div_ceil(CHUNK_ROWS), layer.parameters()]) }
-}
-
-/// Gradient of the weights, `d_weights [sets, out·in + out]`, by way of `partial`; with per-instance weights group `g`
-/// writes set `first_group + g`, so every image has a set of its own.
+/// Gradient of the weights over each part of the rows, `sums [groups · chunks, out·in + out]`; where all rows are one part, that is the gradient.
 pub fn backward_weight(
     b: &mut Builder,
-    rows: Rows,
+    parts: Parts,
     layer: Layer,
     x: BufferId,
     d_y: BufferId,
-    partial: BufferId,
-    d_weights: BufferId,
+    sums: BufferId,
     accumulate: bool,
 ) -> Result<(), PlanError> {
-    let rows = layer.rows(rows);
-    let chunks = rows.rows_per_group.div_ceil(CHUNK_ROWS);
-    let direct = is_direct(rows);
-    let len = size([rows.groups, chunks, layer.parameters()]);
+    let Parts { rows, chunk_rows, chunks } = parts;
     let args = [
         read(x, size([rows.count(), layer.in_features])),
         read(d_y, size([rows.count(), layer.out_features])),
-        if direct { output(d_weights, len, accumulate) } else { overwrite(partial, len) },
+        output(sums, sums_len(parts, layer), accumulate),
     ];
-    let chunk_rows = CHUNK_ROWS.min(rows.rows_per_group);
-    let params = LinearParams { chunk_rows, chunks, ..layer.params(rows, direct && accumulate) };
-    let extent = [layer.out_features, layer.in_features, rows.groups * chunks];
-    b.step(&LINEAR_BACKWARD_WEIGHT, params, &args, extent, loops(chunk_rows), layer.flops(rows))?;
-    if direct {
-        return Ok(());
-    }
-    let groups = sum::Groups { count: rows.groups, first: rows.first_group };
-    sum::forward(b, groups, chunks, layer.parameters(), partial, d_weights, accumulate)
+    let params = LinearParams { chunk_rows, chunks, ..layer.params(rows, accumulate) };
+    let extent = [layer.out_features, layer.in_features, parts.count()];
+    b.step(&LINEAR_BACKWARD_WEIGHT, params, &args, extent, loops(chunk_rows), layer.flops(rows))
+}
+
+/// From the sums of [`backward_weight`] to the gradient, `d_weights [sets, out·in + out]`; with per-instance weights group `g`
+/// has set `first_group + g`, so every image has a set of its own.
+pub fn sum_of_parts(
+    b: &mut Builder,
+    parts: Parts,
+    layer: Layer,
+    sums: BufferId,
+    d_weights: BufferId,
+    accumulate: bool,
+) -> Result<(), PlanError> {
+    let (groups, terms) = match layer.sets {
+        Sets::Shared => (sum::Groups::ONE, parts.count()),
+        Sets::Slots { .. } => (sum::Groups { count: parts.rows.groups, first: parts.rows.first_group }, parts.chunks),
+    };
+    sum::forward(b, groups, terms, layer.parameters(), sums, d_weights, accumulate)
 }

@@ -1,30 +1,10 @@
 //! Backward pass: [`super::forward`] in reverse.
 
 use srn_plan::ops::layer_norm_relu::Saved as NormSaved;
-use srn_plan::ops::{advance, density_sum, embedding, layer_norm_relu, linear, lstm_cell, point_layer, rays};
+use srn_plan::ops::{advance, density_sum, embedding, layer_norm_relu, linear, lstm_cell, point_layer};
 use srn_plan::{BufferId, Builder, PlanError, Rows, Tile};
 
-use super::{BlockBuffers, BlockSaved, HyperBuffers, HyperSaved, Network, Saved, Scratch, SourceBuffers, Started};
-
-/// Partial sums of weight gradients: one buffer, large enough for every layer.
-pub(crate) fn partial_len(network: &Network, rows: Rows) -> usize {
-    let density = network.density.iter().flatten();
-    let marcher = [&network.lstm_input, &network.lstm_hidden, &network.step_head];
-    let blocks = network.scene.iter().chain(density).chain(&network.pixel_generator).chain(marcher);
-    let tile = blocks.map(|block| block_partial_len(block, rows)).max().unwrap_or(0);
-    let slots = Rows::plain(network.batch.slots);
-    let hyper = match &network.source {
-        SourceBuffers::Hypernetwork(hyper) => hyper.layers.iter().flatten().map(|block| block_partial_len(block, slots)).max(),
-        SourceBuffers::Baked(_) => None,
-    };
-    tile.max(hyper.unwrap_or(0)).max(rays::partial_len(rows))
-}
-
-fn block_partial_len(block: &BlockBuffers, rows: Rows) -> usize {
-    let norm = layer_norm_relu::partial_len(rows.count(), block.layer.out_features);
-    let weights = if block.d_weights.is_some() { linear::partial_len(rows, block.layer) } else { 0 };
-    weights.max(if block.d_affine.is_some() { norm } else { 0 })
-}
+use super::{BlockBuffers, BlockSaved, HyperBuffers, HyperSaved, Network, Saved, Scratch, Started, Sums};
 
 /// Where a gradient goes, and whether it is added.
 #[derive(Clone, Copy)]
@@ -33,12 +13,12 @@ struct Into {
     accumulate: bool,
 }
 
-/// Scratch inside an MLP: gradient towards `y` (holds the incoming gradient at first), gradient towards `z`, partial sums.
+/// Scratch inside an MLP: gradient towards `y` (holds the incoming gradient at first), gradient towards `z`, sums of those of the parameters.
 #[derive(Clone, Copy)]
-struct Inside {
+struct Inside<'a> {
     d_y: BufferId,
     d_z: BufferId,
-    partial: BufferId,
+    sums: &'a Sums,
 }
 
 /// From `d_rgb` of the tile's rows, which is left as it is, to `scratch.d_origin` and `scratch.d_direction` of its rays, and to the weights
@@ -48,7 +28,6 @@ pub(crate) fn render(
     network: &Network,
     saved: &Saved,
     scratch: &Scratch,
-    partial: BufferId,
     tile: Tile,
     d_rgb: BufferId,
     d_end: bool,
@@ -60,7 +39,9 @@ pub(crate) fn render(
     let last = network.tracing_steps as usize;
     // x_{i+1} = x_i + …: one buffer carries d_x from the end point to the origin.
     let d_x = scratch.d_origin;
-    let inside = Inside { d_y: scratch.d_y, d_z: scratch.d_z, partial };
+    let sums = &scratch.sums;
+    let inside = Inside { d_y: scratch.d_y, d_z: scratch.d_z, sums };
+    sums.restart(started);
     started.restart(d_x, 0);
     if d_end {
         started.accumulate(d_x, 0);
@@ -81,25 +62,43 @@ pub(crate) fn render(
             d_v = Some(scratch.d_y);
             // … and, before anything else touches d_x, from the marcher.
             if i < last {
-                marcher(b, network, saved, scratch, partial, rows, i, d_v, started)?;
+                marcher(b, network, saved, scratch, rows, i, d_v, started)?;
             }
             let inside = Inside { d_y: d_hidden, ..inside };
             let into = Into { buffer: d_x, accumulate: started.accumulate(d_x, 0) };
             if let Some(hidden) = saved_layers.last() {
-                weights(b, rows, head, hidden.y, d_g, partial, started)?;
+                weights(b, rows, head, hidden.y, d_g, sums, started)?;
                 mlp(b, network, rows, layers, saved.x[i], saved_layers, d_hidden, inside, Some(into), started)?;
             } else {
                 // What the head reads are the points.
                 mlp(b, network, rows, density, saved.x[i], &saved.density[i], d_g, inside, Some(into), started)?;
             }
         } else if i < last {
-            marcher(b, network, saved, scratch, partial, rows, i, None, started)?;
+            marcher(b, network, saved, scratch, rows, i, None, started)?;
             d_v = Some(scratch.d_y);
         }
         let d_v = d_v.expect("set on every path");
         let into = Into { buffer: d_x, accumulate: started.accumulate(d_x, 0) };
         let inside = Inside { d_y: d_v, ..inside };
         mlp(b, network, rows, &network.scene, saved.x[i], &saved.scene[i], d_v, inside, Some(into), started)?;
+    }
+    parameters(b, network, rows, sums, started)
+}
+
+/// Adds what the tile has of the gradients of the parameters, from its sums over parts of the rows.
+fn parameters(b: &mut Builder, network: &Network, rows: Rows, sums: &Sums, started: &mut Started) -> Result<(), PlanError> {
+    let parts = sums.parts(rows);
+    for block in network.blocks_of_rays() {
+        if let Some((d_weights, sums)) = block.d_weights.and_then(|d| Some((d, sums.of(d)?))) {
+            // Tiles of different images write different sets of per-instance weights.
+            let set = if matches!(block.layer.sets, linear::Sets::Shared) { 0 } else { rows.first_group };
+            let accumulate = started.accumulate(d_weights, set);
+            linear::sum_of_parts(b, parts, block.layer, sums, d_weights, accumulate)?;
+        }
+        if let Some((d_affine, sums)) = block.d_affine.and_then(|d| Some((d, sums.of(d)?))) {
+            let (features, accumulate) = (block.layer.out_features, started.accumulate(d_affine, 0));
+            layer_norm_relu::sum_of_parts(b, parts, features, sums, d_affine, accumulate)?;
+        }
     }
     Ok(())
 }
@@ -111,7 +110,6 @@ fn marcher(
     network: &Network,
     saved: &Saved,
     scratch: &Scratch,
-    partial: BufferId,
     rows: Rows,
     i: usize,
     d_v: Option<BufferId>,
@@ -124,14 +122,14 @@ fn marcher(
     let (head, direction, step) = (network.step_head.layer, saved.direction, saved.step[i]);
     let (d_step, d_direction, d_h) = (scratch.d_step, scratch.d_direction, scratch.d_h);
     advance::backward(b, n, head, direction, step, scratch.d_origin, d_step, d_direction, d_h, !first)?;
-    weights(b, rows, &network.step_head, saved.h[i + 1], scratch.d_step, partial, started)?;
+    weights(b, rows, &network.step_head, saved.h[i + 1], scratch.d_step, &scratch.sums, started)?;
 
     let d_c = if first { scratch.zero_state } else { scratch.d_c[(i + 1) % 2] };
     let d_c_prev = scratch.d_c[i % 2];
     let (gates, d_gates) = (saved.gates[i], scratch.d_gates);
     lstm_cell::backward(b, n, network.lstm_size(), gates, saved.c[i], saved.c[i + 1], scratch.d_h, d_c, d_gates, d_c_prev)?;
-    weights(b, rows, &network.lstm_hidden, saved.h[i], d_gates, partial, started)?;
-    weights(b, rows, &network.lstm_input, v, d_gates, partial, started)?;
+    weights(b, rows, &network.lstm_hidden, saved.h[i], d_gates, &scratch.sums, started)?;
+    weights(b, rows, &network.lstm_input, v, d_gates, &scratch.sums, started)?;
     if i > 0 {
         linear::backward_input(b, rows, network.lstm_hidden.layer, d_gates, network.slots, scratch.d_h, false)?;
     }
@@ -147,7 +145,7 @@ fn mlp(
     x: BufferId,
     saved: &[BlockSaved],
     d: BufferId,
-    inside: Inside,
+    inside: Inside<'_>,
     d_x: Option<Into>,
     started: &mut Started,
 ) -> Result<(), PlanError> {
@@ -165,14 +163,14 @@ fn mlp(
         }
         if let Some(affine) = block.affine {
             let norm = NormSaved { x: block_saved.z, stats: block_saved.stats, affine, centred: block.centred };
-            if let Some(d_affine) = block.d_affine {
-                let accumulate = started.accumulate(d_affine, 0);
-                layer_norm_relu::backward_affine(b, rows.count(), features, norm, d, inside.partial, d_affine, accumulate)?;
-            }
             layer_norm_relu::backward_input(b, rows.count(), features, norm, d, inside.d_z)?;
+            if let Some(d_affine) = block.d_affine {
+                let (parts, to) = (inside.sums.parts(rows), inside.sums.of(d_affine).unwrap_or(d_affine));
+                layer_norm_relu::backward_affine(b, parts, features, norm, d, to, started.accumulate(to, 0))?;
+            }
             d = inside.d_z;
         }
-        weights(b, rows, block, input, d, inside.partial, started)?;
+        weights(b, rows, block, input, d, inside.sums, started)?;
         if let Some(into) = into {
             linear::backward_input(b, rows, block.layer, d, network.slots, into.buffer, into.accumulate)?;
             d = into.buffer;
@@ -188,14 +186,12 @@ fn weights(
     block: &BlockBuffers,
     x: BufferId,
     d_y: BufferId,
-    partial: BufferId,
+    sums: &Sums,
     started: &mut Started,
 ) -> Result<(), PlanError> {
     let Some(d_weights) = block.d_weights else { return Ok(()) };
-    // Tiles of different images write different sets of per-instance weights.
-    let part = if matches!(block.layer.sets, linear::Sets::Shared) { 0 } else { rows.first_group };
-    let accumulate = started.accumulate(d_weights, part);
-    linear::backward_weight(b, rows, block.layer, x, d_y, partial, d_weights, accumulate)
+    let to = sums.of(d_weights).unwrap_or(d_weights);
+    linear::backward_weight(b, sums.parts(rows), block.layer, x, d_y, to, started.accumulate(to, 0))
 }
 
 /// From the gradients of f's weights to the hypernetwork's parameters and to `d_z` `[slots, latent]`, the codes of the batch.
@@ -205,11 +201,10 @@ pub(crate) fn hypernetwork(
     hyper: &HyperBuffers,
     saved: &HyperSaved,
     scratch: &HyperScratch,
-    partial: BufferId,
     started: &mut Started,
 ) -> Result<(), PlanError> {
     let rows = Rows::plain(network.batch.slots);
-    let inside = Inside { d_y: scratch.d_y, d_z: scratch.d_hidden, partial };
+    let inside = Inside { d_y: scratch.d_y, d_z: scratch.d_hidden, sums: &Sums::default() };
     for (number, (blocks, scene)) in hyper.layers.iter().zip(&network.scene).enumerate() {
         // A streamed last layer has been gone through already.
         let Some(d) = scratch.d_last_hidden[number].or(scene.d_weights).filter(|_| !blocks.is_empty()) else { continue };

@@ -13,7 +13,7 @@ use srn_plan::ops::linear::{Layer, Sets};
 use srn_plan::ops::point_layer;
 use srn_plan::{BufferId, Builder, PlanError};
 
-pub(crate) use saved::{BlockSaved, HyperSaved, Saved, Scratch};
+pub(crate) use saved::{BlockSaved, HyperSaved, Saved, Scratch, Sums};
 
 use crate::model::{Block, Hypernetwork, Model, Source};
 
@@ -234,6 +234,12 @@ impl Network {
     /// Features of f.
     pub fn features(&self) -> u32 {
         self.scene.last().map_or(0, |block| block.layer.out_features)
+    }
+
+    /// The layers that rays go through, in the paper's order.
+    pub fn blocks_of_rays(&self) -> impl Iterator<Item = &BlockBuffers> {
+        let marcher = [&self.lstm_input, &self.lstm_hidden, &self.step_head];
+        self.scene.iter().chain(marcher).chain(self.density.iter().flatten()).chain(&self.pixel_generator)
     }
 
     /// Size of the LSTM's hidden state.

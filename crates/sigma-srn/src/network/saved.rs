@@ -1,9 +1,11 @@
 //! Buffers of one tile: what the forward pass leaves for the backward pass, and scratch.
 
-use srn_plan::ops::point_layer;
-use srn_plan::{BufferId, Builder, PlanError};
+use std::collections::HashMap;
 
-use super::{BlockBuffers, HyperBuffers, Network, Purpose};
+use srn_plan::ops::{layer_norm_relu, linear, point_layer};
+use srn_plan::{BufferId, Builder, Parts, PlanError, Rows, Tile};
+
+use super::{BlockBuffers, HyperBuffers, Network, Purpose, Started};
 
 /// What a layer leaves behind.
 #[derive(Clone, Copy, Debug)]
@@ -18,7 +20,7 @@ pub(crate) struct BlockSaved {
 
 /// Buffers that are used again and again where nothing must be kept; each is made when it is first wanted.
 #[derive(Default)]
-struct Reused(std::collections::HashMap<&'static str, BufferId>);
+struct Reused(HashMap<&'static str, BufferId>);
 
 impl Reused {
     fn get(&mut self, b: &mut Builder, name: &'static str, len: usize) -> Result<BufferId, PlanError> {
@@ -137,6 +139,51 @@ impl Saved {
     }
 }
 
+/// Sums over parts of a tile's rows, of which gradients of parameters are made.
+#[derive(Debug, Default)]
+pub(crate) struct Sums {
+    /// Rows of a part, at most; all where none is given.
+    part_rows: Option<u32>,
+    /// By gradient. Where all rows are one part, the sum is the gradient itself.
+    sums: HashMap<BufferId, BufferId>,
+}
+
+impl Sums {
+    /// Adds those of what the rays go through, for `tiles` in parts of up to `part_rows` rows.
+    pub fn new(b: &mut Builder, network: &Network, tiles: &[Tile], part_rows: u32) -> Result<Self, PlanError> {
+        let parts = || tiles.iter().map(|tile| Parts::of(tile.rows, part_rows));
+        let one_part = parts().all(|parts| parts.count() == 1);
+        let mut sums = HashMap::new();
+        for (number, block) in network.blocks_of_rays().enumerate() {
+            let one_set = matches!(block.layer.sets, linear::Sets::Shared);
+            if let Some(d_weights) = block.d_weights.filter(|_| !(one_part && one_set)) {
+                let len = parts().map(|parts| linear::sums_len(parts, block.layer)).max().unwrap_or(0);
+                sums.insert(d_weights, b.scratch(format!("sums of d weights {number}"), len)?);
+            }
+            if let Some(d_affine) = block.d_affine.filter(|_| !one_part) {
+                let len = parts().map(|parts| layer_norm_relu::sums_len(parts, block.layer.out_features)).max().unwrap_or(0);
+                sums.insert(d_affine, b.scratch(format!("sums of d affine {number}"), len)?);
+            }
+        }
+        Ok(Sums { part_rows: Some(part_rows), sums })
+    }
+
+    /// The parts of `rows`.
+    pub fn parts(&self, rows: Rows) -> Parts {
+        self.part_rows.map_or(Parts::whole(rows), |most| Parts::of(rows, most))
+    }
+
+    /// Where the sums for a gradient are, if they are not the gradient itself.
+    pub fn of(&self, gradient: BufferId) -> Option<BufferId> {
+        self.sums.get(&gradient).copied()
+    }
+
+    /// Makes the next contribution to each the first one again.
+    pub fn restart(&self, started: &mut Started) {
+        self.sums.values().for_each(|&sums| started.restart(sums, 0));
+    }
+}
+
 /// Scratch of the backward pass.
 #[derive(Debug)]
 pub(crate) struct Scratch {
@@ -157,6 +204,7 @@ pub(crate) struct Scratch {
     pub d_direction: BufferId,
     /// Zeros `[rows, lstm]`: the gradient of the last cell state.
     pub zero_state: BufferId,
+    pub sums: Sums,
 }
 
 impl Saved {
@@ -168,7 +216,7 @@ impl Saved {
 
 impl Scratch {
     /// Adds the buffers for tiles of up to `saved.rows` rows.
-    pub fn new(b: &mut Builder, network: &Network, saved: &Saved) -> Result<Self, PlanError> {
+    pub fn new(b: &mut Builder, network: &Network, saved: &Saved, sums: Sums) -> Result<Self, PlanError> {
         let widest = |blocks: &[BlockBuffers]| blocks.iter().map(|block| block.layer.out_features).max().unwrap_or(1);
         let density = network.density.as_deref().unwrap_or_default();
         let f_and_h = widest(&network.scene).max(widest(&network.pixel_generator));
@@ -191,6 +239,7 @@ impl Scratch {
             d_origin: scratch("d x", 3)?,
             d_direction: scratch("d direction", 3)?,
             zero_state: saved.c[0],
+            sums,
         })
     }
 }

@@ -6,7 +6,7 @@ use std::ops::Range;
 
 use srn_plan::ops::linear::{Layer, Sets};
 use srn_plan::ops::{adam, linear, tile as tile_ops};
-use srn_plan::{BufferId, Builder, Executor, ExecutorError, PlanError, Rows, StageId, Tile, tiles};
+use srn_plan::{BufferId, Builder, Executor, ExecutorError, Parts, PlanError, Rows, StageId, Tile, tiles};
 
 use super::backward::HyperScratch;
 use super::{Batch, HyperSaved, Network, Started};
@@ -157,12 +157,6 @@ impl Streamed {
         }))
     }
 
-    /// Partial sums of weight gradients.
-    pub fn partial_len(&self, network: &Network) -> usize {
-        let lens = self.parts.iter().map(|part| linear::partial_len(Rows::plain(network.batch.slots), part.layer));
-        if self.trained.is_some() { lens.max().unwrap_or(0) } else { 0 }
-    }
-
     /// Adds the stages from the last hidden layers to the weights of f.
     pub fn forward(&mut self, b: &mut Builder, network: &Network, saved: &HyperSaved) -> Result<(), PlanError> {
         let rows = Rows::plain(network.batch.slots);
@@ -198,7 +192,6 @@ impl Streamed {
         b: &mut Builder,
         network: &Network,
         saved: &HyperSaved,
-        partial: BufferId,
         schedule: BufferId,
     ) -> Result<(), PlanError> {
         let Some(Trained { d_weights, moments: [m, v], .. }) = self.trained else { return Ok(()) };
@@ -208,7 +201,7 @@ impl Streamed {
             let gradient = b.stage("gradient of a part");
             self.gather_gradient(b, network, part)?;
             let x = saved.last_hidden(part.scene);
-            linear::backward_weight(b, rows, part.layer, x, self.outputs, partial, d_weights, false)?;
+            linear::backward_weight(b, Parts::whole(rows), part.layer, x, self.outputs, d_weights, false)?;
             let update = b.stage("update of a part");
             adam::step(b, part.layer.parameters(), d_weights, schedule, self.weights, m, v)?;
             stages.push([gradient, update]);
