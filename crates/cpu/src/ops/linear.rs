@@ -175,11 +175,21 @@ pub fn backward_weight<T: Real>(p: LinearParams, x: &[T], d_y: &[T], partial: &m
 }
 
 vectorised! {
-    /// Adds each row to `sums`.
+    /// Adds each row to `sums`, four at a time.
     fn add_rows<T: Real>(rows: &[T], sums: &mut [f64]) {
-        for row in rows.chunks_exact(sums.len()) {
+        let width = sums.len();
+        let fours = rows.chunks_exact(4 * width);
+        for row in fours.remainder().chunks_exact(width) {
             for (sum, value) in sums.iter_mut().zip(row) {
                 *sum += value.wide();
+            }
+        }
+        for four in fours {
+            let (first, last) = four.split_at(2 * width);
+            let (rows, more) = (first.split_at(width), last.split_at(width));
+            let pairs = rows.0.iter().zip(rows.1).zip(more.0.iter().zip(more.1));
+            for (sum, ((&a, &b), (&c, &d))) in sums.iter_mut().zip(pairs) {
+                *sum += ((a + b) + (c + d)).wide();
             }
         }
     }
