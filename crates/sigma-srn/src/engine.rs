@@ -16,8 +16,8 @@ const GPU_TILE_ROWS: u32 = 32_768;
 /// The same for a software adapter.
 const SOFTWARE_TILE_ROWS: u32 = 4096;
 
-/// Rows of a sum: enough for one invocation.
-const GPU_PART_ROWS: u32 = 1024;
+/// Rows of a sum, which are a loop of one invocation.
+const GPU_PART_ROWS: u32 = 512;
 
 /// What computes.
 #[derive(Clone, Debug)]
