@@ -47,6 +47,34 @@ pub enum Requirement {
     FeaturesAtMost256,
     /// The device has subgroups, always of at least eight lanes.
     Subgroups,
+    /// Subgroups of the device, all of one size, multiply matrices of `f16` with sums in `f32`. [`Cooperative::head`] stands before the text.
+    CooperativeMatrices,
+}
+
+/// Matrices that a subgroup multiplies together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Cooperative {
+    /// Rows and columns: 8 or 16.
+    pub side: u32,
+    /// Invocations of a subgroup.
+    pub lanes: u32,
+}
+
+impl Cooperative {
+    /// Invocations of a workgroup, whose subgroups share 64 × 64 results, each with 2 × 2 matrices.
+    pub fn invocations(self) -> u32 {
+        1024 / (self.side * self.side) * self.lanes
+    }
+
+    /// What stands before a text that uses them: `Sums += Left · Right`, the factors in `f16`, the sums in `f32`.
+    pub fn head(self) -> String {
+        let Cooperative { side, lanes } = self;
+        let alias = |name, scalar, role| format!("alias {name} = coop_mat{side}x{side}<{scalar}, {role}>;\n");
+        let aliases = [alias("Left", "f16", "A"), alias("Right", "f16", "B"), alias("Sums", "f32", "C")].concat();
+        format!(
+            "enable f16;\nenable wgpu_cooperative_matrix;\n{aliases}const SIDE: u32 = {side}u;\nconst LANES: u32 = {lanes}u;\n"
+        )
+    }
 }
 
 /// One WGSL text that computes a kernel; every kernel has at least one, and its plain form runs everywhere.
@@ -80,7 +108,7 @@ pub struct Kernel {
 }
 
 impl Kernel {
-    /// The complete WGSL source of one variant: shared functions, then the kernel.
+    /// The WGSL source of one variant: shared functions, then the kernel; complete but for [`Cooperative::head`].
     pub fn source(&self, variant: &Variant) -> String {
         format!("{COMMON}\n{}", variant.text)
     }

@@ -12,5 +12,5 @@ pub mod table;
 
 pub use case::{Case, Sketch};
 pub use close::{assert_close, difference};
-pub use device::gpu;
+pub use device::{cooperative_gpu, gpu};
 pub use lockstep::{Divergence, lockstep};

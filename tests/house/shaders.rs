@@ -2,7 +2,7 @@
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{AddressSpace, GlobalVariable, Module, ScalarKind, ShaderStage, StorageAccess, TypeInner};
-use srn_shaders::{Binding, COMMON, Element, Kernel, Requirement, Scalar, TABLE, Variant};
+use srn_shaders::{Binding, COMMON, Cooperative, Element, Kernel, Requirement, Scalar, TABLE, Variant};
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -11,12 +11,19 @@ fn modules() -> impl Iterator<Item = (String, &'static Kernel, &'static Variant,
     TABLE.iter().flat_map(|kernel| {
         kernel.variants.iter().map(move |variant| {
             let label = format!("{}/{}.wgsl", kernel.op, variant.name);
-            let source = kernel.source(variant);
+            let source = source(kernel, variant);
             let module = naga::front::wgsl::parse_str(&source)
                 .unwrap_or_else(|error| panic!("{label}: {}", error.emit_to_string(&source)));
             (label, *kernel, variant, module)
         })
     })
+}
+
+/// The whole text, for matrices and subgroups of the sizes that most GPUs have.
+fn source(kernel: &Kernel, variant: &Variant) -> String {
+    let cooperative = variant.requires.contains(&Requirement::CooperativeMatrices);
+    let head = cooperative.then(|| Cooperative { side: 16, lanes: 32 }.head());
+    head.unwrap_or_default() + &kernel.source(variant)
 }
 
 fn global<'m>(module: &'m Module, name: &str) -> Option<&'m GlobalVariable> {
@@ -27,10 +34,16 @@ fn global<'m>(module: &'m Module, name: &str) -> Option<&'m GlobalVariable> {
 fn every_kernel_validates() {
     for (label, kernel, variant, module) in modules() {
         // What asks for no subgroups must do without: browsers have none.
-        let subgroups = variant.requires.contains(&Requirement::Subgroups);
-        let capabilities = if subgroups { Capabilities::SUBGROUP } else { Capabilities::empty() };
+        let capabilities = variant.requires.iter().map(|requirement| match requirement {
+            Requirement::Subgroups => Capabilities::SUBGROUP,
+            Requirement::CooperativeMatrices => {
+                Capabilities::SUBGROUP | Capabilities::SHADER_FLOAT16 | Capabilities::COOPERATIVE_MATRIX
+            }
+            Requirement::FeaturesMultipleOf4 | Requirement::FeaturesAtMost256 => Capabilities::empty(),
+        });
+        let capabilities = capabilities.fold(Capabilities::empty(), |all, one| all | one);
         if let Err(error) = Validator::new(ValidationFlags::all(), Capabilities::default() | capabilities).validate(&module) {
-            panic!("{label}: {}", error.emit_to_string(&kernel.source(variant)));
+            panic!("{label}: {}", error.emit_to_string(&source(kernel, variant)));
         }
     }
 }
@@ -42,7 +55,11 @@ fn every_kernel_has_one_entry_point_main() {
         let main = &module.entry_points[0];
         assert_eq!((main.name.as_str(), main.stage), ("main", ShaderStage::Compute), "{label}");
         // Of 32 where an invocation does much: a few hundred rows are then work for more than a few of a device's cores.
-        assert!([32, 64].contains(&main.workgroup_size.iter().product::<u32>()), "{label}");
+        let sizes: &[u32] = if variant.requires.contains(&Requirement::CooperativeMatrices) { &[128] } else { &[32, 64] };
+        assert!(sizes.contains(&main.workgroup_size.iter().product::<u32>()), "{label}");
+        if sizes == [128] {
+            continue; // Its invocations share the tile by subgroups.
+        }
         for (tile, size) in variant.tile.iter().zip(main.workgroup_size) {
             assert_eq!(tile % size, 0, "{label}: tile {:?}, workgroup {:?}", variant.tile, main.workgroup_size);
         }

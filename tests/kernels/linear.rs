@@ -35,6 +35,17 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_subgroup", "row >= params.rows_per_group || out", "row > params.rows_per_group || out"),
         ("forward_subgroup", "sum.r5 + bias", "sum.r5"),
         ("forward_subgroup", "accumulate == 1u", "accumulate == 0u"),
+        ("forward_cooperative", "slots[params.first_group + group]", "slots[group]"),
+        ("forward_cooperative", "268u - ", "254u + 0u * "),
+        ("forward_cooperative", "k < n", "k <= n"),
+        ("forward_cooperative", "y_ba = coopMultiplyAdd(xb", "y_ba = coopMultiplyAdd(xa"),
+        ("forward_cooperative", "xs[j] - high(xs[j])", "0.0 * xs[j]"),
+        ("forward_cooperative", "w_low[STRIDE * (out + SIDE)", "w_low[STRIDE * out"),
+        ("forward_cooperative", "2u * SIDE * (subgroup % (32u / SIDE))", "0u * (subgroup % (32u / SIDE))"),
+        ("forward_cooperative", "min(first_out + r, last_out)", "min(first_out + r, last_out - 1u)"),
+        ("forward_cooperative", "sum + weights[bias + out / 4u]", "sum"),
+        ("forward_cooperative", "row >= params.rows_per_group || out", "row > params.rows_per_group || out"),
+        ("forward_cooperative", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 
@@ -69,6 +80,17 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
             "team = 0u * (subgroup * subgroup_size + lane)",
         ),
         ("backward_input_subgroup", "accumulate == 1u", "accumulate == 0u"),
+        ("backward_input_cooperative", "begin = params.first_out / 4u", "begin = 0u"),
+        ("backward_input_cooperative", "end = params.end_out / 4u", "end = n"),
+        ("backward_input_cooperative", "slots[params.first_group + group]", "slots[group]"),
+        ("backward_input_cooperative", "268u - ", "254u + 0u * "),
+        ("backward_input_cooperative", "o < end)", "o <= end)"),
+        ("backward_input_cooperative", "W_STRIDE * k + in_ + SIDE", "W_STRIDE * k + in_"),
+        ("backward_input_cooperative", "ws[j] - high(ws[j])", "0.0 * ws[j]"),
+        ("backward_input_cooperative", "y_low[Y_STRIDE * (row + SIDE)", "y_low[Y_STRIDE * row"),
+        ("backward_input_cooperative", "4u * first + i / 16u", "4u * first"),
+        ("backward_input_cooperative", "(254u - exponent(r)) << 23u", "127u << 23u"),
+        ("backward_input_cooperative", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 
@@ -166,9 +188,9 @@ fn forward_case(size: Size) -> Case {
 
 /// The last two sum so many outputs that they take two dispatches.
 fn backward_input() -> Vec<Case> {
-    let rows = Rows { groups: 1, rows_per_group: 3, first_group: 0 };
-    let wide = |in_features, out_features| Size { rows, in_features, out_features, sets: 1, accumulate: false };
-    sizes().chain([wide(3, 16_390), wide(4, 16_392)]).map(backward_input_case).collect()
+    let rows = |rows_per_group| Rows { groups: 1, rows_per_group, first_group: 0 };
+    let wide = |rows, in_features, out_features| Size { rows, in_features, out_features, sets: 1, accumulate: false };
+    sizes().chain([wide(rows(3), 3, 16_390), wide(rows(33), 4, 16_392)]).map(backward_input_case).collect()
 }
 
 fn backward_input_case(size: Size) -> Case {

@@ -32,7 +32,7 @@ fn names_the_first_kernel_that_differs() {
     let case = case();
     let tests = [&layer_norm_relu::FORWARD, &layer_norm_relu::BACKWARD_INPUT, &layer_norm_relu::BACKWARD_AFFINE];
     for (step, test) in tests.into_iter().enumerate() {
-        let mut subject = GpuExecutor::new(&test.faulty_gpu(&test.faults[0]), case.plan.clone(), u64::MAX).unwrap();
+        let mut subject = GpuExecutor::new(&test.faulty_gpu(gpu(), &test.faults[0]), case.plan.clone(), u64::MAX).unwrap();
         case.fill(&mut subject).unwrap();
         let divergence = lockstep(&mut subject, &mut reference(&case), case.stage, |_| Some(1e-5)).unwrap_err();
         assert_eq!((divergence.step, divergence.kernel), (step, test.kernel.name), "{divergence}");

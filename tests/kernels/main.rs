@@ -6,7 +6,7 @@ use srn_cpu::CpuExecutor;
 use srn_gpu::{Choice, Gpu, GpuExecutor, wgpu};
 use srn_plan::{Executor, ExecutorError, Kernel, Rows};
 use srn_shaders::{Requirement, TABLE, Variant};
-use srn_tests::{Case, Divergence, gpu, lockstep};
+use srn_tests::{Case, Divergence, cooperative_gpu, gpu, lockstep};
 
 mod adam;
 mod advance;
@@ -105,26 +105,28 @@ impl KernelTest {
     /// Runs every case on every variant, and on the CPU in `f32`; only the steps of this kernel run there, on inputs that the reference
     /// computed.
     fn matches_reference(&self) {
-        let mut worst = 0.0f64;
         for case in (self.cases)() {
             let mut executor = CpuExecutor::<f32>::new(case.plan.clone(), u64::MAX).expect("every kernel has a reference");
             self.worst(&case, &mut executor).unwrap_or_else(|what| panic!("{} on the CPU: {what}", case.name));
         }
         for variant in self.kernel.variants {
-            let gpu = gpu().with_choice(Choice::Named(variant.name.into()));
-            let mut ran = false;
+            // What the device cannot run has no turn.
+            let Some(gpu) = device(variant) else { continue };
+            let gpu = gpu.with_choice(Choice::Named(variant.name.into()));
+            let (mut ran, mut worst) = (false, 0.0f64);
             for case in (self.cases)() {
                 let mut executor =
                     GpuExecutor::new(&gpu, case.plan.clone(), u64::MAX).unwrap_or_else(|error| panic!("{}: {error}", case.name));
                 // Other cases run the plain form, which has its own turn.
                 if self.runs(&case, &executor, variant) {
                     ran = true;
-                    worst = worst.max(self.worst(&case, &mut executor).unwrap_or_else(|what| panic!("{}: {what}", case.name)));
+                    let found = self.worst(&case, &mut executor);
+                    worst = worst.max(found.unwrap_or_else(|what| panic!("{}: {what}", case.name)));
                 }
             }
-            assert!(ran || !can_run(variant), "no case runs {}", variant.name);
+            assert!(ran, "no case runs {}", variant.name);
+            println!("worst {worst:.1e}: {}", self.kernel.label(variant));
         }
-        println!("worst {worst:.1e}: {}", self.kernel.name);
     }
 
     /// Whether some step of this kernel runs this variant.
@@ -146,9 +148,9 @@ impl KernelTest {
     }
 
     /// The device, with a fault planted into this kernel.
-    fn faulty_gpu(&self, &(name, from, to): &Fault) -> Gpu {
+    fn faulty_gpu(&self, gpu: &Gpu, &(name, from, to): &Fault) -> Gpu {
         let op = self.kernel.op;
-        let faulty = gpu().with_sources(move |kernel, variant| {
+        let faulty = gpu.with_sources(move |kernel, variant| {
             let text = kernel.source(variant);
             if (kernel.op, variant.name) == (op, name) { plant(&text, from, to) } else { text }
         });
@@ -156,8 +158,8 @@ impl KernelTest {
     }
 
     /// Whether some case fails with the fault planted.
-    fn catches(&self, fault: &Fault) -> Result<bool, ExecutorError> {
-        let gpu = self.faulty_gpu(fault);
+    fn catches(&self, gpu: &Gpu, fault: &Fault) -> Result<bool, ExecutorError> {
+        let gpu = self.faulty_gpu(gpu, fault);
         for case in (self.cases)() {
             if self.worst(&case, &mut GpuExecutor::new(&gpu, case.plan.clone(), u64::MAX)?).is_err() {
                 return Ok(true);
@@ -167,10 +169,14 @@ impl KernelTest {
     }
 }
 
-/// Whether this device runs the variant at all, on sizes that suit it.
-fn can_run(variant: &Variant) -> bool {
-    let needs_subgroups = variant.requires.contains(&Requirement::Subgroups);
-    !needs_subgroups || gpu().device().features().contains(wgpu::Features::SUBGROUP)
+/// The device that runs the variant, on sizes that suit it; `None` where this machine has none.
+fn device(variant: &Variant) -> Option<&'static Gpu> {
+    let requires = |requirement| variant.requires.contains(&requirement);
+    if requires(Requirement::CooperativeMatrices) {
+        return cooperative_gpu();
+    }
+    let has_subgroups = gpu().device().features().contains(wgpu::Features::SUBGROUP);
+    (has_subgroups || !requires(Requirement::Subgroups)).then(gpu)
 }
 
 /// Changes the first line of code that contains `from`.
@@ -216,12 +222,12 @@ fn subgroups_of_several_teams() {
 #[test]
 fn planted_fault() {
     let runs =
-        |test: &KernelTest, fault: &Fault| test.kernel.variants.iter().any(|variant| variant.name == fault.0 && can_run(variant));
+        |test: &KernelTest, fault: &Fault| test.kernel.variants.iter().find(|variant| variant.name == fault.0).and_then(device);
     let faults = ALL.iter().flat_map(|test| test.faults.iter().map(move |fault| (*test, fault)));
-    let faults: Vec<_> = faults.filter(|(test, fault)| runs(test, fault)).collect();
-    let missed = |&(test, fault): &(&KernelTest, &Fault)| {
+    let faults: Vec<_> = faults.filter_map(|(test, fault)| Some((test, runs(test, fault)?, fault))).collect();
+    let missed = |&(test, gpu, fault): &(&KernelTest, &Gpu, &Fault)| {
         let (variant, from, to) = fault;
-        let what = match test.catches(fault) {
+        let what = match test.catches(gpu, fault) {
             Ok(true) => return None,
             Ok(false) => "is not caught".to_owned(),
             Err(error) => error.to_string(),

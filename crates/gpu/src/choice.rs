@@ -27,7 +27,7 @@ pub enum Choice {
         /// The folder of the file `variants.txt`. One that cannot be read or written is as good as none.
         cache: Option<PathBuf>,
     },
-    /// The variant of this name where a kernel has it and size and device allow it, else the plain form: for tests.
+    /// The variant of this name, or with this ending, where a kernel has it and size and device allow it, else the plain form: for tests.
     Named(String),
 }
 
@@ -52,8 +52,8 @@ pub(crate) struct Chooser {
     chosen: Mutex<HashMap<Shape, &'static Variant>>,
 }
 
-/// A kernel, the widths of a step, and its extent up to the next power of two.
-type Shape = (&'static str, Vec<u32>);
+/// A kernel, whether it may use cooperative matrices, the widths of a step, and its extent up to the next power of two.
+type Shape = (&'static str, bool, Vec<u32>);
 
 impl Chooser {
     pub fn new(choice: Choice) -> Self {
@@ -72,7 +72,8 @@ impl Chooser {
         step: &Step,
         launch: impl Fn(&Variant, [u32; 3]) -> Result<Launch, ExecutorError>,
     ) -> Result<&'static Variant, ExecutorError> {
-        let shape = (step.kernel.name, widths(step).chain(step.extent.map(u32::next_power_of_two)).collect());
+        let cooperative = gpu.cooperative().is_some();
+        let shape = (step.kernel.name, cooperative, widths(step).chain(step.extent.map(u32::next_power_of_two)).collect());
         // Held while measuring: two plans that are built at once would spoil each other's times.
         let mut chosen = lock(&self.chosen);
         if let Some(variant) = chosen.get(&shape) {
@@ -81,7 +82,7 @@ impl Chooser {
         let usable: Vec<&'static Variant> = step.kernel.variants.iter().filter(|variant| is_usable(variant, step, gpu)).collect();
         let variant = match &self.choice {
             _ if usable.len() == 1 => usable[0],
-            Choice::Named(name) => usable.iter().find(|variant| variant.name == name).unwrap_or(&usable[0]),
+            Choice::Named(name) => usable.iter().find(|variant| variant.name.ends_with(name)).unwrap_or(&usable[0]),
             Choice::Measured { cache: None } => measure(gpu, step, &usable, launch)?,
             Choice::Measured { cache: Some(folder) } => {
                 let key = key(gpu, step, &shape, &usable);
@@ -114,6 +115,7 @@ fn is_usable(variant: &Variant, step: &Step, gpu: &Gpu) -> bool {
         Requirement::FeaturesMultipleOf4 => widths(step).all(|width| width % 4 == 0),
         Requirement::FeaturesAtMost256 => widths(step).all(|width| width <= 256),
         Requirement::Subgroups => gpu.has_subgroups(),
+        Requirement::CooperativeMatrices => gpu.cooperative().is_some(),
     })
 }
 

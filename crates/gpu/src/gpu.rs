@@ -4,7 +4,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 
 use srn_plan::{ExecutorError, Kernel};
-use srn_shaders::Variant;
+use srn_shaders::{Cooperative, Requirement, Variant};
 
 use crate::choice::{Choice, Chooser};
 use crate::pipeline::Pipeline;
@@ -61,6 +61,12 @@ pub enum OpenError {
         /// The driver's reason.
         what: String,
     },
+    /// [`Gpu::open_cooperative`]: the adapter multiplies no matrices of `f16`.
+    #[error("adapter `{adapter}` has no square cooperative matrices of f16 with sums in f32 for subgroups of one size")]
+    NoCooperativeMatrices {
+        /// Name of the adapter.
+        adapter: String,
+    },
 }
 
 /// All adapters, the one that [`Gpu::open`] prefers first: discrete, integrated, virtual, other, software.
@@ -85,6 +91,28 @@ fn enumerate() -> Vec<wgpu::Adapter> {
     found
 }
 
+/// What cooperative matrices of `f16` need.
+const COOPERATIVE: wgpu::Features =
+    wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX.union(wgpu::Features::SHADER_F16).union(wgpu::Features::SUBGROUP);
+
+/// Bytes of workgroup memory that they take, rounded up to what all such devices offer.
+const COOPERATIVE_STORAGE: u32 = 32 << 10;
+
+/// The largest matrices that subgroups of this adapter multiply in `f16` with sums in `f32`.
+fn find_cooperative(adapter: &wgpu::Adapter) -> Option<Cooperative> {
+    use wgpu::wgt::CooperativeScalarType::{F16, F32};
+    let info = adapter.get_info();
+    let is_whole = adapter.features().contains(COOPERATIVE) && info.subgroup_min_size == info.subgroup_max_size;
+    let properties = adapter.cooperative_matrix_properties().into_iter();
+    let sides = properties.filter(|p| (p.ab_type, p.cr_type) == (F16, F32) && p.m_size == p.n_size && p.n_size == p.k_size);
+    let side = sides.map(|p| p.m_size).max().filter(|_| is_whole)?;
+    let cooperative = Cooperative { side, lanes: info.subgroup_min_size };
+    let limits = adapter.limits();
+    let is_supported = cooperative.invocations() <= wgpu::Limits::default().max_compute_invocations_per_workgroup
+        && limits.max_compute_workgroup_storage_size >= COOPERATIVE_STORAGE;
+    is_supported.then_some(cooperative)
+}
+
 type Sources = dyn Fn(&Kernel, &Variant) -> String + Send + Sync;
 
 /// What all clones of a [`Gpu`] share.
@@ -104,11 +132,23 @@ pub struct Gpu {
     shared: Arc<Shared>,
     sources: Arc<Sources>,
     chooser: Arc<Chooser>,
+    /// For kernels that multiply them.
+    cooperative: Option<Cooperative>,
 }
 
 impl Gpu {
     /// Opens the adapter whose name contains `adapter_name` (in any case), or the first of [`adapters`].
     pub fn open(adapter_name: Option<&str>) -> Result<Gpu, OpenError> {
+        Self::open_with(adapter_name, false)
+    }
+
+    /// The same with cooperative matrices (tensor cores), an experimental feature of wgpu: where a linear layer is fastest so, the factors
+    /// of its products are sums of two numbers in `f16`, of 22 digits for the 24 of `f32`, and its sums in `f32`.
+    pub fn open_cooperative(adapter_name: Option<&str>) -> Result<Gpu, OpenError> {
+        Self::open_with(adapter_name, true)
+    }
+
+    fn open_with(adapter_name: Option<&str>, with_cooperative: bool) -> Result<Gpu, OpenError> {
         let mut found = enumerate();
         let names: Vec<String> = found.iter().map(|adapter| adapter.get_info().name).collect();
         let chosen = match adapter_name {
@@ -120,22 +160,35 @@ impl Gpu {
                 .ok_or_else(|| OpenError::NotFound { wanted: wanted.into(), found: names.clone() })?,
         };
         let adapter = found.swap_remove(chosen);
-        let optional = wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::SUBGROUP;
+        let mut features = adapter.features() & (wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::SUBGROUP);
+        let mut experimental_features = wgpu::ExperimentalFeatures::disabled();
+        let mut limits = wgpu::Limits::default();
+        let mut cooperative = None;
+        if with_cooperative {
+            let found = find_cooperative(&adapter);
+            cooperative = Some(found.ok_or_else(|| OpenError::NoCooperativeMatrices { adapter: names[chosen].clone() })?);
+            features |= COOPERATIVE;
+            limits.max_compute_workgroup_storage_size = COOPERATIVE_STORAGE;
+            // SAFETY: what is experimental are WGSL's cooperative matrices. Our texts load and store them within the arrays that they
+            // declare, in uniform control flow.
+            experimental_features = unsafe { wgpu::ExperimentalFeatures::enabled() };
+        }
         let request = adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("sigma-srn"),
-            required_features: adapter.features() & optional,
+            required_features: features,
+            experimental_features,
             // Default limits, so that what runs here runs elsewhere, except for the size of the work.
             required_limits: wgpu::Limits {
                 max_storage_buffer_binding_size: adapter.limits().max_storage_buffer_binding_size,
                 max_buffer_size: adapter.limits().max_buffer_size,
-                ..wgpu::Limits::default()
+                ..limits
             },
             memory_hints: wgpu::MemoryHints::MemoryUsage,
             ..Default::default()
         });
         let (device, queue) = pollster::block_on(request)
             .map_err(|error| OpenError::Refused { adapter: names[chosen].clone(), what: one_line(&error.to_string()) })?;
-        let gpu = Gpu::from_device(device, queue);
+        let gpu = Gpu { cooperative, ..Gpu::from_device(device, queue) };
         let shared = gpu.shared.clone();
         gpu.device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
             lock(&shared.uncaptured).get_or_insert(one_line(&error.to_string()));
@@ -152,7 +205,24 @@ impl Gpu {
     /// The caller's error handlers stay as they are: errors caused by calls of this crate are caught in error scopes.
     pub fn from_device(device: wgpu::Device, queue: wgpu::Queue) -> Gpu {
         tracing::debug!(adapter = %AdapterInfo::from(device.adapter_info()), features = ?device.features(), "device");
-        Gpu { device, queue, shared: Arc::default(), sources: Arc::new(Kernel::source), chooser: Arc::default() }
+        Gpu {
+            device,
+            queue,
+            shared: Arc::default(),
+            sources: Arc::new(Kernel::source),
+            chooser: Arc::default(),
+            cooperative: None,
+        }
+    }
+
+    /// The same device, for products in `f32` alone.
+    pub fn without_cooperative(&self) -> Gpu {
+        Gpu { cooperative: None, ..self.clone() }
+    }
+
+    /// Matrices that subgroups multiply; none but with [`Gpu::open_cooperative`].
+    pub fn cooperative(&self) -> Option<Cooperative> {
+        self.cooperative
     }
 
     /// The same device, with WGSL texts from `sources` in place of [`Kernel::source`]: kernels in development, planted faults.
@@ -206,7 +276,11 @@ impl Gpu {
 
     /// The WGSL text of a kernel variant.
     pub(crate) fn source(&self, kernel: &Kernel, variant: &Variant) -> String {
-        (self.sources)(kernel, variant)
+        let text = (self.sources)(kernel, variant);
+        match self.cooperative {
+            Some(cooperative) if variant.requires.contains(&Requirement::CooperativeMatrices) => cooperative.head() + &text,
+            _ => text,
+        }
     }
 
     /// The pipeline of a kernel variant, compiled on first use.
