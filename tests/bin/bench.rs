@@ -7,8 +7,8 @@ use std::process::ExitCode;
 use std::time::{Instant, SystemTime};
 
 use sigma_srn::{
-    Descent, Engine, Gpu, Intrinsics, Loss, Method, Model, ModelConfig, Pose6, Rays, Renderer, Shape, Train, Trainer,
-    TrainingBatch, camera, pixel_grid, stream,
+    Descent, Engine, Gpu, Intrinsics, Loss, Method, Model, ModelConfig, Options, Phase, Pose6, Query, Rays, Renderer, Shape,
+    Train, Trainer, TrainingBatch, camera, estimate, pixel_grid, stream,
 };
 use srn_tests::between;
 use srn_tests::peer::{Peer, PeerRow};
@@ -150,6 +150,18 @@ fn run() -> Result<()> {
                 }
             }
         }
+        // Where there are cooperative matrices, a pose step with them, and what they change.
+        if let Ok(gpu) = Gpu::open_cooperative(None) {
+            let engine = Engine::gpu(gpu);
+            let mut bench = Bench { engine: &engine, model: &model, runs: if quick { 1 } else { 3 }, ceilings: &mut ceilings };
+            let difference = bench.cooperative_difference()?;
+            let (row, mut descent) = bench.pose_step(ADAM, BATCH, SIDE)?;
+            kernels.extend(profile(&mut descent, width, "gpu, cooperative")?);
+            let so = if engine.is_cooperative() { "allowed" } else { "refused" };
+            let what = format!("{}; cooperative matrices {so}, which change pose gradients by {difference:.1e}", row.what);
+            rows.push(Row { what, ..row });
+            eprintln!("{}", line(&rows[rows.len() - 1]));
+        }
     }
     let ceiling = median(&mut ceilings);
     let mut text = report(&hardware, ceiling, &rows, &scaling, &kernels);
@@ -241,6 +253,15 @@ impl Bench<'_> {
         let name = if matches!(method, Method::Adam { .. }) { "Adam" } else { "BFGS" };
         let what = format!("pose step, {name}, {hypotheses} hypotheses");
         Ok((self.row(what, time, descent.flops_per_step(), descent.bytes()), descent))
+    }
+
+    /// What the search for a pose finds cooperative matrices to change in gradients, before it decides on them.
+    fn cooperative_difference(&self) -> Result<f64> {
+        let (starts, rgb) = (camera::fixed24(1.3)[..8].to_vec(), target(3 * RAYS));
+        let query = Query { instance: 0, intrinsics: intrinsics(SIDE), width: SIDE, height: SIDE, rgb, weights: None, starts };
+        let phases = vec![Phase { steps: 0, stride: 4, keep: 1 }];
+        estimate(self.engine, self.model, &[query], &Options { phases, min_starts: 0, ..Options::default() }, |_| Ok(()))?;
+        Ok(self.engine.cooperative_difference().unwrap_or(f64::NAN))
     }
 
     fn training_step(&mut self) -> Result<Row> {

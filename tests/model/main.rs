@@ -8,6 +8,7 @@ use srn_plan::{BufferId, Executor};
 
 mod baked;
 mod behaviour;
+mod cooperative;
 mod finite_differences;
 mod golden;
 mod lockstep;

@@ -57,10 +57,25 @@ impl EngineArgs {
             }
         };
         eprintln!("{reason}");
-        Ok(match self.memory {
+        Ok(self.budgeted(engine))
+    }
+
+    /// The same with cooperative matrices, on a GPU.
+    pub fn open_cooperative(&self) -> Result<Engine> {
+        log(self.verbose);
+        if self.executor == Executor::Cpu {
+            return Err("--cooperative is for GPUs: the CPU executor has no cooperative matrices".into());
+        }
+        let gpu = Gpu::open_cooperative(self.adapter.as_deref())?;
+        eprintln!("GPU executor on {}, as --cooperative asks", gpu.adapter());
+        Ok(self.budgeted(Engine::gpu(gpu)))
+    }
+
+    fn budgeted(&self, engine: Engine) -> Engine {
+        match self.memory {
             Some(bytes) => engine.with_budget(bytes),
             None => engine,
-        })
+        }
     }
 
     /// The same, but what no flag says is as in an earlier call: the executor by its name, and the memory budget, since both

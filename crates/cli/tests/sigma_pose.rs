@@ -339,6 +339,8 @@ fn bad_calls_end_with_2_and_one_line() {
         (format!("{image} {model} --preset paper --loss gmsd --stride 2 --executor cpu"), &["stride 1"]),
         (format!("{image} {model} --memory 1 --executor cpu"), &["budget of 1 bytes"]),
         (format!("{image} {model} --adapter no-such-card"), &["no-such-card"]),
+        (format!("{image} {model} --cooperative --adapter no-such-card"), &["no-such-card"]),
+        (format!("{image} {model} --cooperative --executor cpu"), &["--cooperative", "cooperative matrices"]),
         (format!("evaluate {model} --data nowhere"), &["nowhere"]),
         (format!("evaluate {model} --data DATA/forklift"), &["forklift", "none of its 1 instances"]),
         (format!("evaluate {model} --data DATA --views 0"), &["--views"]),

@@ -130,7 +130,7 @@ impl Descent {
         let on_host = OnHost::of(engine, model, 1);
         let (plan, mut handles) =
             engine.fit(rows, model.layout.features(), |b, tile_rows| build(b, model, shape, method, tile_rows, &on_host))?;
-        let mut runner = engine.prepare(plan)?;
+        let mut runner = engine.prepare_descent(plan)?;
         handles.instances.upload(&mut *runner, &handles.network, model)?;
         if let Moves::Bfgs { seeds, .. } = handles.moves {
             for (channel, seed) in seeds.into_iter().enumerate() {

@@ -1,5 +1,7 @@
 //! Where plans run: a GPU through wgpu, or the CPU.
 
+use std::iter::zip;
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use srn_cpu::CpuExecutor;
@@ -19,6 +21,9 @@ const SOFTWARE_TILE_ROWS: u32 = 4096;
 /// Rows of a sum, which are a loop of one invocation.
 const GPU_PART_ROWS: u32 = 512;
 
+/// Most difference that cooperative matrices may make to a pose gradient, relative to the largest.
+const COOPERATIVE_LIMIT: f64 = 0.01;
+
 /// What computes.
 #[derive(Clone, Debug)]
 enum Kind {
@@ -34,12 +39,14 @@ pub struct Engine {
     budget: u64,
     /// The user's choice; by kind and width of the network where there is none.
     tile_rows: Option<u32>,
+    /// Where cooperative matrices are wanted: the difference that they were found to make, see [`Engine::cooperative_difference`].
+    cooperative: Option<Arc<OnceLock<f64>>>,
 }
 
 impl Engine {
     /// The CPU in `f32`, with all threads of the current rayon pool.
     pub fn cpu() -> Self {
-        Engine { kind: Kind::Cpu, budget: CPU_BUDGET, tile_rows: None }
+        Engine { kind: Kind::Cpu, budget: CPU_BUDGET, tile_rows: None, cooperative: None }
     }
 
     /// The CPU in `f64`: the oracle of the tests.
@@ -48,9 +55,13 @@ impl Engine {
     }
 
     /// A GPU, or a software adapter: opened by [`Gpu::open`], or made from the caller's device by [`Gpu::from_device`].
+    ///
+    /// With one that was opened by [`Gpu::open_cooperative`], poses are looked for with cooperative matrices; see
+    /// [`Engine::cooperative_difference`].
     pub fn gpu(gpu: Gpu) -> Self {
         let budget = gpu.default_memory_budget();
-        Engine { kind: Kind::Gpu(gpu), budget, tile_rows: None }
+        let cooperative = gpu.cooperative().map(|_| Arc::default());
+        Engine { kind: Kind::Gpu(gpu), budget, tile_rows: None, cooperative }
     }
 
     /// The GPU where there is an adapter that is not a software one, else whichever executor is faster on a small matrix
@@ -85,6 +96,32 @@ impl Engine {
     /// The same with at most `rows` rays in flight.
     pub fn with_tile_rows(self, rows: u32) -> Self {
         Engine { tile_rows: Some(rows.max(1)), ..self }
+    }
+
+    /// What cooperative matrices change in the pose gradients of the first few hypotheses, relative to the largest of their numbers; above
+    /// 0.01 the engine goes on without. Known once [`estimate`](crate::estimate) has begun on an engine that has them; clones share it.
+    pub fn cooperative_difference(&self) -> Option<f64> {
+        self.cooperative.as_ref()?.get().copied()
+    }
+
+    /// Whether poses are looked for with cooperative matrices.
+    pub fn is_cooperative(&self) -> bool {
+        self.cooperative_difference().is_some_and(|difference| difference <= COOPERATIVE_LIMIT)
+    }
+
+    /// Finds [`Engine::cooperative_difference`] if it is wanted and not known yet; `gradients` are evaluated once without and once with them.
+    pub(crate) fn check_cooperative(&self, gradients: impl Fn(&Engine) -> Result<Vec<[f64; 6]>, Error>) -> Result<(), Error> {
+        let Some(known) = self.cooperative.as_ref().filter(|known| known.get().is_none()) else { return Ok(()) };
+        let found = |difference: f64| Engine { cooperative: Some(Arc::new(difference.into())), ..self.clone() };
+        let (without, with) = (gradients(&found(f64::INFINITY))?.concat(), gradients(&found(0.0))?.concat());
+        let largest = without.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
+        let difference = zip(&without, &with).fold(0.0, |worst: f64, (a, b)| worst.max((a - b).abs()));
+        // Maxima pass over what is not a number.
+        let is_finite = without.iter().chain(&with).all(|value| value.is_finite());
+        let difference = if is_finite { difference / largest.max(f64::MIN_POSITIVE) } else { f64::INFINITY };
+        // Another thread may have been first, with the same outcome.
+        known.get_or_init(|| difference);
+        Ok(())
     }
 
     /// The memory budget in bytes.
@@ -166,8 +203,16 @@ impl Engine {
         Ok(match &self.kind {
             Kind::Cpu => Runner::Cpu(CpuExecutor::new(plan, self.budget)?),
             Kind::CpuF64 => Runner::CpuF64(CpuExecutor::new(plan, self.budget)?),
-            Kind::Gpu(gpu) => Runner::Gpu(GpuExecutor::new(gpu, plan, self.budget)?),
+            Kind::Gpu(gpu) => Runner::Gpu(GpuExecutor::new(&gpu.without_cooperative(), plan, self.budget)?),
         })
+    }
+
+    /// The same for one that looks for poses.
+    pub(crate) fn prepare_descent(&self, plan: Plan) -> Result<Runner, ExecutorError> {
+        match &self.kind {
+            Kind::Gpu(gpu) if self.is_cooperative() => Ok(Runner::Gpu(GpuExecutor::new(gpu, plan, self.budget)?)),
+            _ => self.prepare(plan),
+        }
     }
 
     /// Seconds of the best of three products of 4096 rows with 128 × 128 weights, after a first one that compiles.
@@ -200,6 +245,7 @@ impl std::fmt::Display for Engine {
         match &self.kind {
             Kind::Cpu => write!(f, "cpu"),
             Kind::CpuF64 => write!(f, "cpu64"),
+            Kind::Gpu(gpu) if self.is_cooperative() => write!(f, "{}, cooperative matrices", gpu.adapter().name),
             Kind::Gpu(gpu) => write!(f, "{}", gpu.adapter().name),
         }
     }

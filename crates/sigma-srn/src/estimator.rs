@@ -13,6 +13,9 @@ use crate::{Error, Rays, pixel_grid};
 /// How far starts are turned that the search adds. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
 const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
 
+/// Hypotheses that cooperative matrices are tried on.
+const TRIED: usize = 8;
+
 /// An image whose camera pose is wanted.
 #[derive(Clone, Debug)]
 pub struct Query {
@@ -208,6 +211,12 @@ pub fn estimate(
         let starts: Vec<DMat4> = q.starts.iter().copied().chain(around.into_iter().flatten()).collect();
         hypotheses.extend(starts.iter().enumerate().map(new));
     }
+    engine.check_cooperative(|engine| {
+        let tried = &hypotheses[..hypotheses.len().min(TRIED)];
+        let mut descent = prepare(engine, model, queries, options, &options.phases[0], tried)?;
+        descent.evaluate()?;
+        descent.gradients()
+    })?;
 
     for (number, phase) in options.phases.iter().enumerate() {
         let mut running: Vec<Hypothesis> = Vec::new();

@@ -97,7 +97,7 @@ pub fn run(args: &Calibrate) -> Result<bool> {
     let mut model = load_model(&args.model)?;
     let (side, all) = views::open(&model, &args.data, u32::MAX, u32::MAX)?;
     refuse_existing([args.out.clone()], args.force)?;
-    let engine = args.engine.open()?;
+    let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
     let at_truth = AtTruth::of(on, &all)?;
     let mut asked = spread(all, args.instances as usize);

@@ -150,7 +150,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
         }
         refuse_existing([path.clone()], args.force)?;
     }
-    let engine = args.engine.open()?;
+    let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
     if args.unseen {
         let found = unseen(args, on, &pictures, &starts)?;

@@ -133,7 +133,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
         refuse_existing(files.map(|file| dir.join(file)), args.force)?;
         create_dir(dir)?;
     }
-    let engine = args.engine.open()?;
+    let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
     let found = views::search(&asked, on, &args.search, &args.starts, &notation, |_, _, _| Ok(()))?;
 

@@ -17,7 +17,7 @@ use sigma_srn::{
 use super::files::Picture;
 use super::notation::Notation;
 use super::positive;
-use crate::common::Result;
+use crate::common::{EngineArgs, Result};
 
 /// What `--accept` is for a model without a calibration.
 const ACCEPT: f64 = 0.25;
@@ -64,6 +64,10 @@ pub struct SearchArgs {
     /// Compare every N-th pixel of every N-th row, in all phases. Default: the preset's.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     stride: Option<u32>,
+    /// Multiply cooperative matrices (tensor cores) on a GPU that has them, where they are faster: f32 as sums of two numbers in f16. The pose
+    /// gradients of the first starts are compared with those in f32, which is said; beyond 1 % of the largest, f32 it is.
+    #[arg(long)]
+    cooperative: bool,
     /// Decides the random initial depths of the rays.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -164,6 +168,11 @@ impl SearchArgs {
         SearchArgs { accept: Some(f64::INFINITY), ..self.clone() }
     }
 
+    /// The executor, with cooperative matrices where they are asked for.
+    pub fn open(&self, engine: &EngineArgs) -> Result<Engine> {
+        if self.cooperative { engine.open_cooperative() } else { engine.open() }
+    }
+
     /// The settings of the estimator.
     pub fn options(&self) -> Result<Options> {
         let mut options = match self.preset {
@@ -204,9 +213,14 @@ impl SearchArgs {
     ) -> Result<Vec<Found>> {
         let On { engine, model, side } = on;
         let queries: Vec<_> = pictures.iter().zip(starts).map(|(picture, starts)| query(picture, side, starts)).collect();
+        let is_checked = engine.cooperative_difference().is_some();
         let began = Instant::now();
         let estimates = estimate(engine, model, &queries, options, observe)?;
         let seconds = began.elapsed().as_secs_f64() / pictures.len() as f64;
+        if let Some(difference) = engine.cooperative_difference().filter(|_| !is_checked) {
+            let so = if engine.is_cooperative() { "used" } else { "not used" };
+            eprintln!("cooperative matrices are {so}: with them pose gradients differ by {:.1e} of the largest", difference);
+        }
 
         let view = |(picture, found): (&Picture, &Estimate)| (picture.instance, found.pose.to_matrix(), picture.intrinsics);
         let views: Vec<View> = pictures.iter().zip(&estimates).map(view).collect();

@@ -96,7 +96,7 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     refuse_existing(paths.clone(), args.force)?;
     create_dir(dir)?;
 
-    let mut bench = Bench { args, engine: args.engine.open()?, dir, symmetries: vec![], outcomes: vec![] };
+    let mut bench = Bench { args, engine: args.search.open(&args.engine)?, dir, symmetries: vec![], outcomes: vec![] };
     let mae = LOSSES[0];
     let setting = |table, preset, starts: &Starts| Setting {
         table,

@@ -78,7 +78,7 @@ pub fn run(args: &Track) -> Result<bool> {
     if let Some(path) = &args.record {
         refuse_existing([path.clone()], args.force)?;
     }
-    let engine = args.engine.open()?;
+    let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
     let all_around = args.search.options()?;
     // The next pose is near; what would have to be found from afar is searched for all around instead.
