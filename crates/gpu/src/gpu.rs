@@ -103,13 +103,16 @@ fn find_cooperative(adapter: &wgpu::Adapter) -> Option<Cooperative> {
     use wgpu::wgt::CooperativeScalarType::{F16, F32};
     let info = adapter.get_info();
     let is_whole = adapter.features().contains(COOPERATIVE) && info.subgroup_min_size == info.subgroup_max_size;
+    // llvmpipe (Mesa 26.1.6) with vectors of 512 bits, 16 lanes, crashes when it compiles them.
+    if info.device_type == wgpu::DeviceType::Cpu && info.subgroup_min_size > 8 {
+        return None;
+    }
     let properties = adapter.cooperative_matrix_properties().into_iter();
     let sides = properties.filter(|p| (p.ab_type, p.cr_type) == (F16, F32) && p.m_size == p.n_size && p.n_size == p.k_size);
     let side = sides.map(|p| p.m_size).max().filter(|_| is_whole)?;
     let cooperative = Cooperative { side, lanes: info.subgroup_min_size };
-    let limits = adapter.limits();
     let is_supported = cooperative.invocations() <= wgpu::Limits::default().max_compute_invocations_per_workgroup
-        && limits.max_compute_workgroup_storage_size >= COOPERATIVE_STORAGE;
+        && adapter.limits().max_compute_workgroup_storage_size >= COOPERATIVE_STORAGE;
     is_supported.then_some(cooperative)
 }
 
