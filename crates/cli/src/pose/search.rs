@@ -218,8 +218,8 @@ impl SearchArgs {
         let estimates = estimate(engine, model, &queries, options, observe)?;
         let seconds = began.elapsed().as_secs_f64() / pictures.len() as f64;
         if let Some(difference) = engine.cooperative_difference().filter(|_| !is_checked) {
-            let so = if engine.is_cooperative() { "used" } else { "not used" };
-            eprintln!("cooperative matrices are {so}: with them pose gradients differ by {:.1e} of the largest", difference);
+            let so = if engine.is_cooperative() { "wherever they are faster" } else { "are not used" };
+            eprintln!("cooperative matrices {so}: with them pose gradients differ by {difference:.1e} of the largest");
         }
 
         let view = |(picture, found): (&Picture, &Estimate)| (picture.instance, found.pose.to_matrix(), picture.intrinsics);
