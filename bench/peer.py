@@ -3,11 +3,11 @@
 
     python3 bench/peer.py check FILE.safetensors...    against golden values; exit 1 beyond a relative difference of 1e-4
     python3 bench/peer.py chance FILE.safetensors...   how often PyTorch itself parts from golden values, for no more than rounding
-    python3 bench/peer.py time --width 64 --json       median seconds of a pose step and of a training step
+    echo "pose step, kept" | python3 bench/peer.py serve --width 64    the seconds of each step that a line names
 
 It serves no other purpose. Both steps come in two versions: "as released" evaluates the scene features f again at every point
 for the density-weighted sum, as the authors' code does; "kept" reuses those of the march. `check` runs the very steps that
-`time` measures. Tensors have the names of the golden files, so that weights map one to one.
+`serve` measures. Tensors have the names of the golden files, so that weights map one to one.
 """
 
 import argparse
@@ -281,19 +281,6 @@ def chance(files, runs):
     return 0
 
 
-def median_seconds(work, runs, device):
-    """Median of several runs, after one (three on a GPU) that pays for the first use of kernels and memory."""
-    on_gpu, seconds = device.type == "cuda", []
-    warm_up = 3 if on_gpu else 1
-    for _ in range(warm_up + runs):
-        begin = time.perf_counter()
-        work()
-        if on_gpu:
-            torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - begin)
-    return round(statistics.median(seconds[warm_up:]), 6)
-
-
 def any_batch(images, device):
     """Rays and colours of the right sizes, seen from about where a camera would be; values do not matter for time."""
     grid = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE)).flip(1).float()
@@ -304,38 +291,36 @@ def any_batch(images, device):
     return Batch(*(tensor.to(device) for tensor in batch)), pose.to(device)
 
 
-def timed(width, images, runs, device):
-    """Rows of the table, each as soon as it is there."""
+def steps(width, images, device):
+    """The steps by their names. Reading the losses is part of one, as in the programs that take one."""
     torch.manual_seed(0)
-    model = Model(width, LATENT[width], INSTANCES, TRACING_STEPS).to(device)
-    size = {"side": SIDE, "width": width}
+    looking, learning = (Model(width, LATENT[width], INSTANCES, TRACING_STEPS).to(device) for _ in range(2))
     batch, pose = any_batch(HYPOTHESES, device)
     batch = batch._replace(instances=torch.zeros_like(batch.instances))
-    for version, keep in VERSIONS.items():
-        arguments = frozen(model, batch, pose)
-        # Reading the losses is part of the step, as in the programs that take one.
-        seconds = median_seconds(lambda: pose_step(*arguments, batch, keep).tolist(), runs, device)
-        yield {"work": "pose step", "hypotheses": HYPOTHESES, **size, "version": version, "seconds": seconds}
-    model.requires_grad_(True)
+    descent = (*frozen(looking, batch, pose), batch)
     batch, pose = any_batch(images, device)
-    adam, cameras = torch.optim.Adam(model.parameters(), 5e-5), pose_matrix(pose)
-    for version, keep in VERSIONS.items():
-        seconds = median_seconds(lambda: training_step(model, cameras, adam, batch, keep).item(), runs, device)
-        yield {"work": "training step", "images": images, **size, "version": version, "seconds": seconds}
+    training = (learning, pose_matrix(pose), torch.optim.Adam(learning.parameters(), 5e-5), batch)
+    poses = {f"pose step, {name}": lambda keep=keep: pose_step(*descent, keep).tolist() for name, keep in VERSIONS.items()}
+    trainings = {f"training step, {name}": lambda keep=keep: training_step(*training, keep).item() for name, keep in VERSIONS.items()}
+    return poses | trainings
 
 
-def measure(arguments, device):
+def serve(arguments, device):
+    """Says what it runs on and which steps there are, then runs the step that each line of its input names."""
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
+    named = steps(arguments.width, arguments.images, device)
     name = torch.cuda.get_device_name() if device.type == "cuda" else platform.processor() or platform.machine()
-    about = {"torch": torch.__version__, "device": name, "threads": torch.get_num_threads()}
-    rows = timed(arguments.width, arguments.images, arguments.runs, device)
-    if arguments.json:
-        print(json.dumps({**about, "rows": list(rows)}))
-    else:
-        print(", ".join(f"{key} {value}" for key, value in about.items()))
-        for row in rows:
-            print(", ".join(f"{key} {value}" for key, value in row.items()), flush=True)
+    about = {"torch": torch.__version__, "device": name, "threads": torch.get_num_threads(), "steps": list(named)}
+    print(json.dumps(about), flush=True)
+    for line in map(str.strip, sys.stdin):
+        if line not in named:
+            refuse(f"{line} is none of: {'; '.join(named)}")
+        begin = time.perf_counter()
+        named[line]()
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        print(round(time.perf_counter() - begin, 6), flush=True)
     return 0
 
 
@@ -353,15 +338,13 @@ def main():
     by_chance = commands.add_parser("chance", help="train and refine from weights moved within their rounding")
     by_chance.add_argument("files", nargs="+", metavar="FILE")
     by_chance.add_argument("--runs", type=count, default=16, help="runs in each precision (default: 16)")
-    timing = commands.add_parser("time", help="measure the steps")
-    timing.add_argument("--width", type=int, choices=LATENT, required=True)
-    timing.add_argument("--threads", type=count, help="threads on the CPU (default: PyTorch's choice)")
-    timing.add_argument("--runs", type=count, default=3, help="runs of each step after the warm-up (default: 3)")
-    timing.add_argument("--images", type=count, default=10, help="images of the training step (default: 10)")
-    timing.add_argument("--json", action="store_true")
-    for command in [checking, timing]:
+    serving = commands.add_parser("serve", help="take the steps that the input names, and time them")
+    serving.add_argument("--width", type=int, choices=LATENT, required=True)
+    serving.add_argument("--threads", type=count, help="threads on the CPU (default: PyTorch's choice)")
+    serving.add_argument("--images", type=count, default=10, help="images of the training step (default: 10)")
+    for command in [checking, serving]:
         command.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
-    for each in [parser, checking, by_chance, timing]:
+    for each in [parser, checking, by_chance, serving]:
         each.error = refuse
     arguments = parser.parse_args()
     if arguments.command == "chance":
@@ -369,7 +352,7 @@ def main():
     if arguments.device == "cuda" and not torch.cuda.is_available():
         refuse("--device cuda: this PyTorch finds no CUDA device")
     device = torch.device(arguments.device)
-    return check(arguments.files, device) if arguments.command == "check" else measure(arguments, device)
+    return check(arguments.files, device) if arguments.command == "check" else serve(arguments, device)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,9 @@
 //! `bench [--quick] [--json] [--write]`: what a pose step, a training step and a picture cost on every executor, beside the rate
-//! that the matrix library reaches in the same run, and beside PyTorch where `python3` (or the interpreter that `PYTHON` names) has it. `--write` puts the tables into `docs/performance.md`.
+//! that the matrix library reaches in the same run, and beside PyTorch where `python3` (or the interpreter that `PYTHON` names) has it.
+//! All that is compared takes turns, so that a busy minute of the machine meets all alike. `--write` puts the tables into
+//! `docs/performance.md`.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::ExitCode;
@@ -11,7 +14,7 @@ use sigma_srn::{
     Train, Trainer, TrainingBatch, camera, estimate, pixel_grid, stream,
 };
 use srn_tests::between;
-use srn_tests::peer::{Peer, PeerRow};
+use srn_tests::peer::Peer;
 
 const USAGE: &str = "usage: bench [--quick] [--json] [--write]";
 const SIDE: u32 = 64;
@@ -24,13 +27,17 @@ const ADAM: Method = Method::Adam { loss: Loss::Mae, learning_rate: 0.01 };
 const SMALL_BUDGET: u64 = 256 << 20;
 /// Rows of a tile where the CPU's kernels are timed alone: with some hundred, as they run, starting the threads would count most.
 const ALONE_ROWS: u32 = 4096;
+/// Turns of works that take tenths of a second, which are disturbed more, and of longer ones; and seconds from which one turn must do.
+const MANY_TURNS: usize = 9;
+const TURNS: usize = 3;
+const LONG: f64 = 30.0;
 /// Hypotheses and side of the image, from one to the other end of what is asked for.
 const SCALING: [(u32, u32); 8] = [(5, 16), (5, 32), (5, 64), (5, 128), (1, 32), (5, 32), (24, 32), (120, 32)];
 
 /// One line of the table.
-#[derive(Clone, Debug)]
+#[derive(serde::Serialize)]
 struct Row {
-    what: String,
+    work: String,
     width: u32,
     executor: &'static str,
     seconds: f64,
@@ -42,31 +49,64 @@ struct Row {
     budget: u64,
 }
 
+/// One line of the table of steps in PyTorch.
+#[derive(serde::Serialize)]
+struct PeerRow {
+    /// `pose step` or `training step`.
+    work: String,
+    width: u32,
+    /// `as released`: f evaluated again for the sum; `kept`: once.
+    version: String,
+    seconds: f64,
+    /// `cpu` or `cuda`.
+    device: &'static str,
+}
+
 /// One line of the table of costs against work: a pose step of Adam at width 64.
+#[derive(serde::Serialize)]
 struct Scaling {
     executor: &'static str,
     hypotheses: u32,
     side: u32,
+    rays: u32,
     seconds: f64,
 }
 
-impl Scaling {
-    fn rays(&self) -> u32 {
-        self.hypotheses * self.side * self.side
-    }
-}
-
 /// Time of one kernel in one run of a stage.
+#[derive(serde::Serialize)]
 struct KernelRow {
     width: u32,
     executor: &'static str,
-    label: String,
+    kernel: String,
     steps: usize,
     seconds: f64,
     flops: u64,
 }
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error>>;
+
+/// Something that is timed: one turn of it takes so many seconds.
+type Turn<'a> = Box<dyn FnMut() -> Result<f64> + 'a>;
+
+/// A work of ours: its row of the table, without times yet.
+struct Work {
+    row: Row,
+    turn: Turn<'static>,
+}
+
+/// What one run finds.
+#[derive(Default)]
+struct Report {
+    hardware: String,
+    /// What PyTorch ran on.
+    peers_on: Vec<String>,
+    /// Rates of the matrix library.
+    ceilings: Vec<f64>,
+    rows: Vec<Row>,
+    peers: Vec<PeerRow>,
+    scaling: Vec<Scaling>,
+    kernels: Vec<KernelRow>,
+}
 
 fn main() -> ExitCode {
     match run() {
@@ -84,92 +124,74 @@ fn run() -> Result<()> {
         return Err(format!("{USAGE}, not {other}").into());
     }
     let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
-    let (quick, json) = (has("--quick"), has("--json"));
+    let quick = has("--quick");
 
     let mut engines = vec![Engine::cpu()];
     match Gpu::open(None) {
         Ok(gpu) => engines.push(Engine::gpu(gpu)),
         Err(error) => eprintln!("only the CPU executor: {error}"),
     }
-    let hardware = hardware(&engines);
-    eprintln!("{hardware}");
-    let peer = Peer::find();
-    let (mut peer_on, mut peer_rows) = (String::new(), Vec::new());
-    let (mut rows, mut kernels, mut ceilings, mut scaling) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let mut report = Report { hardware: hardware(&engines), ..Report::default() };
+    eprintln!("{}", report.hardware);
+    let [many_turns, turns] = if quick { [1, 1] } else { [MANY_TURNS, TURNS] };
     // The small nets first: the kernels of the large ones are compiled then.
     for width in if quick { vec![64] } else { vec![64, 256] } {
         let model = model(width)?;
-        for engine in &engines {
-            // What takes a tenth of a second is disturbed more.
-            let runs = match width {
-                _ if quick => 1,
-                64 if engine.as_gpu().is_none() => 9,
-                _ => 3,
-            };
-            let mut bench = Bench { engine, model: &model, runs, ceilings: &mut ceilings };
-            let (row, mut descent) = bench.pose_step(ADAM, BATCH, SIDE)?;
-            if engine.as_gpu().is_none() {
-                let engine = engine.clone().with_tile_rows(ALONE_ROWS);
-                let mut alone = Bench { engine: &engine, model: &model, runs: 1, ceilings: &mut Vec::new() };
-                descent = alone.pose_step(ADAM, BATCH, SIDE)?.1;
-            }
-            kernels.extend(profile(&mut descent, width, name(engine))?);
-            drop(descent);
-            let before = rows.len();
-            rows.push(row);
+        let benches: Vec<_> = engines.iter().map(|engine| Bench { engine, model: &model }).collect();
+        let peers: Vec<_> = Peer::start(width)?.into_iter().map(RefCell::new).collect();
+        report.peers_on = peers.iter().map(|peer| peer.borrow().runs_on.clone()).collect();
+
+        let mut works = Vec::new();
+        for bench in &benches {
+            works.push(bench.pose_step(ADAM, BATCH, SIDE)?);
             if width == 64 {
-                rows.push(bench.pose_step(Method::Bfgs { soft: 0.3 }, BATCH, SIDE)?.0);
+                works.push(bench.pose_step(Method::Bfgs { soft: 0.3 }, BATCH, SIDE)?);
             }
-            // Long, and of two budgets.
-            bench.runs = runs.div_ceil(3);
-            rows.push(bench.training_step()?);
+            works.push(bench.picture()?);
+        }
+        let rows = report.take_turns(if width == 64 { many_turns } else { turns }, works, "pose step", &peers)?;
+        report.rows.extend(rows);
+
+        let mut works = Vec::new();
+        for bench in &benches {
+            works.push(bench.training_step()?);
             if !quick {
-                let engine = engine.clone().with_budget(SMALL_BUDGET);
-                let mut bench = Bench { engine: &engine, model: &model, runs: 1, ceilings: &mut ceilings };
-                rows.push(bench.training_step()?);
+                let engine = bench.engine.clone().with_budget(SMALL_BUDGET);
+                works.push(Bench { engine: &engine, ..*bench }.training_step()?);
             }
-            let mut bench = Bench { engine, model: &model, runs, ceilings: &mut ceilings };
-            rows.push(bench.picture()?);
-            rows[before..].iter().for_each(|row| eprintln!("{}", line(row)));
-            // At once after ours, for machines are slower at some times than at others.
-            if let Some(peer) = peer.as_ref().filter(|_| engine.as_gpu().is_none()) {
-                let (on, measured) = peer.time(width)?;
-                measured.iter().for_each(|row| {
-                    eprintln!(
-                        "PyTorch {}, {}: {} at width {} in {:.3} s",
-                        row.device, row.version, row.work, row.width, row.seconds
-                    )
-                });
-                peer_on = on;
-                peer_rows.extend(measured);
-            }
+        }
+        let rows = report.take_turns(turns, works, "training step", &peers)?;
+        report.rows.extend(rows);
+        drop(peers);
+
+        for bench in &benches {
             if width == 64 && !quick {
-                for (hypotheses, side) in SCALING {
-                    let (row, _) = bench.pose_step(ADAM, hypotheses, side)?;
-                    scaling.push(Scaling { executor: row.executor, hypotheses, side, seconds: row.seconds });
+                let works = SCALING.map(|(hypotheses, side)| bench.pose_step(ADAM, hypotheses, side));
+                let works = works.into_iter().collect::<Result<_>>()?;
+                let rows = report.take_turns(if bench.is_gpu() { turns } else { many_turns }, works, "cost against work", &[])?;
+                for ((hypotheses, side), Row { executor, seconds, .. }) in SCALING.into_iter().zip(rows) {
+                    report.scaling.push(Scaling { executor, hypotheses, side, rays: hypotheses * side * side, seconds });
                 }
             }
+            report.kernels.extend(bench.profile(bench.name())?);
         }
         // Where there are cooperative matrices, a pose step with them, and what they change.
         if let Ok(gpu) = Gpu::open_cooperative(None) {
             let engine = Engine::gpu(gpu);
-            let mut bench = Bench { engine: &engine, model: &model, runs: if quick { 1 } else { 3 }, ceilings: &mut ceilings };
+            let bench = Bench { engine: &engine, model: &model };
             let difference = bench.cooperative_difference()?;
-            let (row, mut descent) = bench.pose_step(ADAM, BATCH, SIDE)?;
-            kernels.extend(profile(&mut descent, width, "gpu, cooperative")?);
+            let rows = report.take_turns(turns, vec![bench.pose_step(ADAM, BATCH, SIDE)?], "cooperative matrices", &[])?;
             let so = if engine.is_cooperative() { "allowed" } else { "refused" };
-            let what = format!("{}; cooperative matrices {so}, which change pose gradients by {difference:.1e}", row.what);
-            rows.push(Row { what, ..row });
-            eprintln!("{}", line(&rows[rows.len() - 1]));
+            let named = |work| format!("{work}; cooperative matrices {so}, which change pose gradients by {difference:.1e}");
+            report.rows.extend(rows.into_iter().map(|row| Row { work: named(row.work), ..row }));
+            report.kernels.extend(bench.profile("gpu, cooperative")?);
         }
     }
-    let ceiling = median(&mut ceilings);
-    let mut text = report(&hardware, ceiling, &rows, &scaling, &kernels);
-    text += &against_pytorch(&peer_on, &peer_rows, &rows);
-    if json {
-        println!("{:#}", as_json(&hardware, ceiling, &rows, &scaling, &kernels, &peer_rows));
-    } else {
-        println!("{text}");
+    report.rows.sort_by_key(|row| (row.width, row.executor));
+    let text = report.text() + &report.against_pytorch();
+    match has("--json") {
+        true => println!("{:#}", report.json()),
+        false => println!("{text}"),
     }
     if has("--write") {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/performance.md");
@@ -179,15 +201,122 @@ fn run() -> Result<()> {
     Ok(())
 }
 
+impl Report {
+    /// Works of ours, and the steps of the peers whose names begin with `what` they do, take turns: one that pays for first use, and `turns`
+    /// that are timed. The rows of ours; those of the peers are kept.
+    fn take_turns(&mut self, turns: usize, works: Vec<Work>, what: &str, peers: &[RefCell<Peer>]) -> Result<Vec<Row>> {
+        let (mut rows, mut all): (Vec<Row>, Vec<Turn>) = works.into_iter().map(|work| (work.row, work.turn)).unzip();
+        let width = rows[0].width;
+        let mut peer_rows = Vec::new();
+        for peer in peers {
+            for name in peer.borrow().steps.iter().filter(|name| name.starts_with(what)) {
+                let (work, version) = name.split_once(", ").ok_or_else(|| format!("bench/peer.py has a step {name}"))?;
+                let device = peer.borrow().device;
+                peer_rows.push(PeerRow { work: work.into(), width, version: version.into(), seconds: 0.0, device });
+                let name = name.clone();
+                all.push(Box::new(move || peer.borrow_mut().take(&name)));
+            }
+        }
+
+        let mut times = vec![(Vec::new(), Vec::new()); all.len()];
+        for turn in 0..=turns {
+            match turn {
+                0 => eprintln!("{what}, width {width}: first use"),
+                _ => eprintln!("{what}, width {width}: turn {turn} of {turns}"),
+            }
+            for (work, (seconds, rates)) in all.iter_mut().zip(&mut times) {
+                if turn > 1 && seconds[0] > LONG {
+                    continue;
+                }
+                let rate = sgemm_rate();
+                let time = work()?;
+                if turn > 0 {
+                    seconds.push(time);
+                    rates.push(rate);
+                }
+            }
+        }
+        let mut medians = times.iter_mut().map(|(seconds, rates)| {
+            self.ceilings.extend(&*rates);
+            (median(seconds), median(rates))
+        });
+        for (row, (seconds, rate)) in rows.iter_mut().zip(&mut medians) {
+            (row.seconds, row.of_sgemm) = (seconds, row.flops as f64 / seconds / rate);
+        }
+        for (row, (seconds, _)) in peer_rows.iter_mut().zip(medians) {
+            row.seconds = seconds;
+        }
+        rows.iter().for_each(|row| eprintln!("{}", line(row)));
+        for PeerRow { work, width, version, seconds, device } in &peer_rows {
+            eprintln!("PyTorch on {device}, {version}: {work} at width {width} in {seconds:.3} s");
+        }
+        self.peers.extend(peer_rows);
+        Ok(rows)
+    }
+
+    fn text(&mut self) -> String {
+        let mut text = format!("{}. `cargo xtask bench`\n\n", self.hardware);
+        let ceiling = median(&mut self.ceilings) / 1e9;
+        text += &format!("Matrix library (`gemm`, 1536 × 1536 × 1536, all threads) in the same run: {ceiling:.0} GFLOP/s.\n\n");
+        text += "| work, 64 × 64 pixels | width | executor | median time | GFLOP | GFLOP/s | of sgemm | plan of budget |\n";
+        text += "|---|---|---|---|---|---|---|---|\n";
+        self.rows.iter().for_each(|row| text += &format!("{}\n", line(row)));
+        if !self.scaling.is_empty() {
+            text += "\nCost against work, a pose step of Adam at width 64:\n\n";
+            text += "| executor | hypotheses | side | rays | median time | µs a ray |\n|---|---|---|---|---|---|\n";
+        }
+        for Scaling { executor, hypotheses, side, rays, seconds } in &self.scaling {
+            let each = 1e6 * seconds / f64::from(*rays);
+            text += &format!("| {executor} | {hypotheses} | {side} | {rays} | {:.1} ms | {each:.2} |\n", 1e3 * seconds);
+        }
+        text += "\nKernels of a pose step of Adam, each timed alone:\n\n";
+        text += "| width | executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|---|\n";
+        for of_one in self.kernels.chunk_by(|a, b| (a.width, a.executor) == (b.width, b.executor)) {
+            for KernelRow { width, executor, kernel, steps, seconds, flops } in of_one.iter().take(8) {
+                let rate = if *flops == 0 { String::new() } else { format!("{:.1}", *flops as f64 / seconds / 1e9) };
+                text += &format!("| {width} | {executor} | `{kernel}` | {steps} | {:.1} | {rate} |\n", 1e3 * seconds);
+            }
+        }
+        text
+    }
+
+    /// The same steps in PyTorch, and how many times faster ours are.
+    fn against_pytorch(&self) -> String {
+        if self.peers.is_empty() {
+            return String::new();
+        }
+        let mut text = format!(
+            "\nThe same steps in PyTorch (`bench/peer.py`), by turns with ours: {}. `as released`: f is evaluated again for the sum, as in the authors' code; `kept`: it is not.\n\n",
+            self.peers_on.join("; ")
+        );
+        text += "| work | width | PyTorch on | version | PyTorch | ours, cpu | faster | ours, gpu | faster |\n";
+        text += "|---|---|---|---|---|---|---|---|---|\n";
+        for PeerRow { work, width, version, seconds, device } in &self.peers {
+            let ours = |executor: &str| {
+                let is_it = |row: &&Row| row.width == *width && row.executor == executor && row.work.starts_with(work);
+                // The first of a kind: Adam, and the default budget.
+                let ours = self.rows.iter().find(is_it).map(|row| row.seconds);
+                ours.map_or(" | ".into(), |ours| format!("{ours:.3} s | {:.2}", seconds / ours))
+            };
+            text +=
+                &format!("| {work} | {width} | {device} | {version} | {seconds:.3} s | {} | {} |\n", ours("cpu"), ours("gpu"));
+        }
+        text
+    }
+
+    fn json(&mut self) -> serde_json::Value {
+        serde_json::json!({
+            "hardware": self.hardware, "sgemm_flops_per_second": median(&mut self.ceilings), "rows": self.rows,
+            "scaling": self.scaling, "kernels": self.kernels, "pytorch_on": self.peers_on, "pytorch": self.peers,
+        })
+    }
+}
+
 /// The paper's nets, or the compact ones.
 fn model(width: u32) -> Result<Model> {
     let latent = if width == 256 { 256 } else { 32 };
     let config = ModelConfig { hidden: width, latent, instances: 9, tracing_steps: 10, density: true };
     Ok(Model::init(&config, 1)?)
-}
-
-fn name(engine: &Engine) -> &'static str {
-    if engine.as_gpu().is_some() { "gpu" } else { "cpu" }
 }
 
 fn intrinsics(side: u32) -> Intrinsics {
@@ -209,34 +338,33 @@ fn target(values: u32) -> Vec<f32> {
     (0..values).map(|k| (k * 7919 % 200) as f32 / 100.0 - 1.0).collect()
 }
 
+#[derive(Clone, Copy)]
 struct Bench<'a> {
     engine: &'a Engine,
     model: &'a Model,
-    runs: usize,
-    ceilings: &'a mut Vec<f64>,
 }
 
 impl Bench<'_> {
-    /// Median seconds of several runs, with the rate of the matrix library measured before each.
-    fn measure(&mut self, mut work: impl FnMut() -> Result<()>) -> Result<(f64, f64)> {
-        work()?;
-        let (mut seconds, mut rates) = (Vec::new(), Vec::new());
-        for _ in 0..self.runs {
-            rates.push(sgemm_rate());
+    fn is_gpu(&self) -> bool {
+        self.engine.as_gpu().is_some()
+    }
+
+    fn name(&self) -> &'static str {
+        if self.is_gpu() { "gpu" } else { "cpu" }
+    }
+
+    fn work(&self, work: &str, flops: u64, bytes: u64, mut once: impl FnMut() -> Result<()> + 'static) -> Work {
+        let (width, executor, budget) = (self.model.layout.features(), self.name(), self.engine.budget());
+        let row = Row { work: work.into(), width, executor, seconds: 0.0, flops, of_sgemm: 0.0, bytes, budget };
+        let turn = Box::new(move || {
             let begin = Instant::now();
-            work()?;
-            seconds.push(begin.elapsed().as_secs_f64());
-        }
-        self.ceilings.extend(&rates);
-        Ok((median(&mut seconds), median(&mut rates)))
+            once()?;
+            Ok(begin.elapsed().as_secs_f64())
+        });
+        Work { row, turn }
     }
 
-    fn row(&self, what: String, (seconds, ceiling): (f64, f64), flops: u64, bytes: u64) -> Row {
-        let (width, executor, budget) = (self.model.layout.features(), name(self.engine), self.engine.budget());
-        Row { what, width, executor, seconds, flops, of_sgemm: flops as f64 / seconds / ceiling, bytes, budget }
-    }
-
-    fn pose_step(&mut self, method: Method, hypotheses: u32, side: u32) -> Result<(Row, Descent)> {
+    fn descent(&self, method: Method, hypotheses: u32, side: u32) -> Result<Descent> {
         let pixels = side * side;
         let shape = Shape { hypotheses, width: side, height: side, instances: 1 };
         let mut descent = Descent::new(self.engine, self.model, shape, method)?;
@@ -244,15 +372,19 @@ impl Bench<'_> {
         descent.set_targets(&[0], &vec![0; hypotheses as usize], &rays(hypotheses, side, pixels), &target, None)?;
         let poses = camera::fixed24(1.3).iter().cycle().take(hypotheses as usize).map(Pose6::from_matrix).collect::<Vec<_>>();
         descent.set_poses(&poses)?;
-        let time = self.measure(|| {
+        Ok(descent)
+    }
+
+    fn pose_step(&self, method: Method, hypotheses: u32, side: u32) -> Result<Work> {
+        let name = if matches!(method, Method::Adam { .. }) { "Adam" } else { "BFGS" };
+        let mut descent = self.descent(method, hypotheses, side)?;
+        let (work, flops) = (format!("pose step, {name}, {hypotheses} hypotheses"), descent.flops_per_step());
+        Ok(self.work(&work, flops, descent.bytes(), move || {
             descent.evaluate()?;
             descent.descend()?;
             descent.losses()?;
             Ok(())
-        })?;
-        let name = if matches!(method, Method::Adam { .. }) { "Adam" } else { "BFGS" };
-        let what = format!("pose step, {name}, {hypotheses} hypotheses");
-        Ok((self.row(what, time, descent.flops_per_step(), descent.bytes()), descent))
+        }))
     }
 
     /// What the search for a pose finds cooperative matrices to change in gradients, before it decides on them.
@@ -264,55 +396,57 @@ impl Bench<'_> {
         Ok(self.engine.cooperative_difference().unwrap_or(f64::NAN))
     }
 
-    fn training_step(&mut self) -> Result<Row> {
+    fn training_step(&self) -> Result<Work> {
         const IMAGES: u32 = 10;
         let mut trainer = Trainer::new(self.engine, self.model.clone(), Train::Everything, IMAGES, RAYS)?;
         let instances = (0..IMAGES).map(|image| image % 9).collect();
         let batch = TrainingBatch { instances, rays: rays(IMAGES, SIDE, RAYS), target_rgb: target(3 * IMAGES * RAYS) };
-        let time = self.measure(|| {
-            trainer.step(&batch, 1e-4)?;
-            trainer.losses()?;
-            Ok(())
-        })?;
         let plan = trainer.executor().plan();
         let flops = plan.stages.iter().flat_map(|stage| &stage.steps).map(|step| step.flops).sum();
         let bytes = plan.bytes();
-        Ok(self.row("training step, 10 images".into(), time, flops, bytes))
+        Ok(self.work("training step, 10 images", flops, bytes, move || {
+            trainer.step(&batch, 1e-4)?;
+            trainer.losses()?;
+            Ok(())
+        }))
     }
 
-    fn picture(&mut self) -> Result<Row> {
+    fn picture(&self) -> Result<Work> {
         let mut renderer = Renderer::new(self.engine, self.model, 1, SIDE, SIDE)?;
         let cameras = [(camera::fixed24(1.3)[3], intrinsics(SIDE))];
-        let time = self.measure(|| {
+        // A fifth of a pose step is one picture forward and backward; only its time is reported.
+        Ok(self.work("picture", 0, 0, move || {
             renderer.render(&[0], &cameras, 0)?;
             Ok(())
-        })?;
-        // A fifth of a pose step is one picture forward and backward; only its time is reported.
-        Ok(self.row("picture".into(), time, 0, 0))
+        }))
     }
-}
 
-/// Time of each kernel: from the device's clock on a GPU, from ours on the CPU.
-fn profile(descent: &mut Descent, width: u32, executor: &'static str) -> Result<Vec<KernelRow>> {
-    let row = |(label, (steps, seconds, flops))| KernelRow { width, executor, label, steps, seconds, flops };
-    if let Some(times) = descent.profile()? {
-        return Ok(times.into_iter().map(|time| row((time.label, (time.steps, time.seconds, time.flops)))).collect());
+    /// Time of each kernel of a pose step: from the device's clock on a GPU, from ours on the CPU.
+    fn profile(&self, executor: &'static str) -> Result<Vec<KernelRow>> {
+        let width = self.model.layout.features();
+        let row = |(kernel, (steps, seconds, flops))| KernelRow { width, executor, kernel, steps, seconds, flops };
+        let rows_alone = |engine: &Engine| if self.is_gpu() { engine.clone() } else { engine.clone().with_tile_rows(ALONE_ROWS) };
+        let mut descent = Bench { engine: &rows_alone(self.engine), ..*self }.descent(ADAM, BATCH, SIDE)?;
+        descent.evaluate()?;
+        if let Some(times) = descent.profile()? {
+            return Ok(times.into_iter().map(|time| row((time.label, (time.steps, time.seconds, time.flops)))).collect());
+        }
+        let running = descent.executor();
+        let plan = running.plan().clone();
+        let evaluate = plan.stages.iter().position(|stage| stage.name == "evaluate").expect("a descent evaluates");
+        let mut times: BTreeMap<String, (usize, f64, u64)> = BTreeMap::new();
+        for (index, step) in plan.stages[evaluate].steps.iter().enumerate() {
+            let begin = Instant::now();
+            running.run_step(plan.stage_id(evaluate), index)?;
+            let (steps, seconds, flops) = times.entry(step.kernel.name.into()).or_default();
+            *steps += 1;
+            *seconds += begin.elapsed().as_secs_f64();
+            *flops += step.flops;
+        }
+        let mut rows: Vec<KernelRow> = times.into_iter().map(row).collect();
+        rows.sort_by(|a, b| b.seconds.total_cmp(&a.seconds));
+        Ok(rows)
     }
-    let running = descent.executor();
-    let plan = running.plan().clone();
-    let evaluate = plan.stages.iter().position(|stage| stage.name == "evaluate").expect("a descent evaluates");
-    let mut times: BTreeMap<String, (usize, f64, u64)> = BTreeMap::new();
-    for (index, step) in plan.stages[evaluate].steps.iter().enumerate() {
-        let begin = Instant::now();
-        running.run_step(plan.stage_id(evaluate), index)?;
-        let (steps, seconds, flops) = times.entry(step.kernel.name.into()).or_default();
-        *steps += 1;
-        *seconds += begin.elapsed().as_secs_f64();
-        *flops += step.flops;
-    }
-    let mut rows: Vec<KernelRow> = times.into_iter().map(row).collect();
-    rows.sort_by(|a, b| b.seconds.total_cmp(&a.seconds));
-    Ok(rows)
 }
 
 /// Floating-point operations a second of the matrix library, with all threads, on a product that fits no cache; best of two.
@@ -361,7 +495,7 @@ fn date() -> String {
 
 fn line(row: &Row) -> String {
     let seconds = if row.seconds < 0.1 { format!("{:.1} ms", 1e3 * row.seconds) } else { format!("{:.2} s", row.seconds) };
-    let mut cells = vec![row.what.clone(), row.width.to_string(), row.executor.into(), seconds];
+    let mut cells = vec![row.work.clone(), row.width.to_string(), row.executor.into(), seconds];
     if row.flops == 0 {
         cells.extend(["", "", "", ""].map(String::from));
     } else {
@@ -371,89 +505,4 @@ fn line(row: &Row) -> String {
         cells.push(format!("{} of {} MiB", row.bytes >> 20, row.budget >> 20));
     }
     format!("| {} |", cells.join(" | "))
-}
-
-fn report(hardware: &str, ceiling: f64, rows: &[Row], scaling: &[Scaling], kernels: &[KernelRow]) -> String {
-    let mut text = format!("{hardware}. `cargo xtask bench`\n\n");
-    text +=
-        &format!("Matrix library (`gemm`, 1536 × 1536 × 1536, all threads) in the same run: {:.0} GFLOP/s.\n\n", ceiling / 1e9);
-    text += "| work, 64 × 64 pixels | width | executor | median time | GFLOP | GFLOP/s | of sgemm | plan of budget |\n";
-    text += "|---|---|---|---|---|---|---|---|\n";
-    rows.iter().for_each(|row| text += &format!("{}\n", line(row)));
-    if !scaling.is_empty() {
-        text += "\nCost against work, a pose step of Adam at width 64:\n\n";
-        text += "| executor | hypotheses | side | rays | median time | µs a ray |\n|---|---|---|---|---|---|\n";
-    }
-    for row in scaling {
-        let Scaling { executor, hypotheses, side, seconds } = row;
-        let (rays, each) = (row.rays(), 1e6 * seconds / f64::from(row.rays()));
-        text += &format!("| {executor} | {hypotheses} | {side} | {rays} | {:.1} ms | {each:.2} |\n", 1e3 * seconds);
-    }
-    text += "\nKernels of a pose step of Adam, each timed alone:\n\n| width | executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|---|\n";
-    for of_one in kernels.chunk_by(|a, b| (a.width, a.executor) == (b.width, b.executor)) {
-        for KernelRow { width, executor, label, steps, seconds, flops } in of_one.iter().take(8) {
-            let rate = if *flops == 0 { String::new() } else { format!("{:.1}", *flops as f64 / seconds / 1e9) };
-            text += &format!("| {width} | {executor} | `{label}` | {steps} | {:.1} | {rate} |\n", 1e3 * seconds);
-        }
-    }
-    text
-}
-
-/// The same steps in PyTorch, and how many times faster ours are.
-fn against_pytorch(ran_on: &str, peers: &[PeerRow], rows: &[Row]) -> String {
-    if peers.is_empty() {
-        return String::new();
-    }
-    let mut text = format!(
-        "\nThe same steps in PyTorch (`bench/peer.py`), in the same run: {ran_on}. `as released`: f is evaluated again for the sum, as in the authors' code; `kept`: it is not.\n\n"
-    );
-    text += "| work | width | PyTorch on | version | PyTorch | ours, cpu | faster | ours, gpu | faster |\n|---|---|---|---|---|---|---|---|---|\n";
-    for peer in peers {
-        let ours = |executor: &str| {
-            let is_it = |row: &&Row| row.width == peer.width && row.executor == executor && row.what.starts_with(&peer.work);
-            // The first of a kind: Adam, and the default budget.
-            let seconds = rows.iter().find(is_it).map(|row| row.seconds);
-            seconds.map_or(" | ".into(), |seconds| format!("{seconds:.3} s | {:.2}", peer.seconds / seconds))
-        };
-        let PeerRow { work, width, version, seconds, device } = peer;
-        text += &format!("| {work} | {width} | {device} | {version} | {seconds:.3} s | {} | {} |\n", ours("cpu"), ours("gpu"));
-    }
-    text
-}
-
-fn as_json(
-    hardware: &str,
-    ceiling: f64,
-    rows: &[Row],
-    scaling: &[Scaling],
-    kernels: &[KernelRow],
-    peers: &[PeerRow],
-) -> serde_json::Value {
-    let scaling: Vec<_> = scaling
-        .iter()
-        .map(|row| {
-            serde_json::json!({
-                "executor": row.executor, "hypotheses": row.hypotheses, "side": row.side, "rays": row.rays(), "seconds": row.seconds,
-            })
-        })
-        .collect();
-    let rows: Vec<_> = rows
-        .iter()
-        .map(|row| {
-            serde_json::json!({
-                "work": row.what, "width": row.width, "executor": row.executor, "seconds": row.seconds, "flops": row.flops,
-                "of_sgemm": row.of_sgemm, "bytes": row.bytes, "budget": row.budget,
-            })
-        })
-        .collect();
-    let kernels: Vec<_> = kernels
-        .iter()
-        .map(|kernel| {
-            serde_json::json!({
-                "width": kernel.width, "executor": kernel.executor, "kernel": kernel.label, "steps": kernel.steps, "seconds": kernel.seconds,
-                "flops": kernel.flops,
-            })
-        })
-        .collect();
-    serde_json::json!({ "hardware": hardware, "sgemm_flops_per_second": ceiling, "rows": rows, "scaling": scaling, "kernels": kernels, "pytorch": peers })
 }

@@ -1,66 +1,78 @@
 //! The peer of the benchmark: the same steps in PyTorch (`bench/peer.py`), where there is one.
 
+use std::error::Error;
+use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
-/// Time of a step in PyTorch.
-#[derive(Clone, Debug, serde::Serialize, serde::Deserialize)]
-pub struct PeerRow {
-    /// `pose step` or `training step`.
-    pub work: String,
-    /// Features of the networks.
-    pub width: u32,
-    /// `as released`: f evaluated again for the sum; `kept`: once.
-    pub version: String,
-    /// Median.
-    pub seconds: f64,
-    /// `cpu` or `cuda`.
-    #[serde(default)]
-    pub device: String,
-}
-
+/// What the script says first.
 #[derive(serde::Deserialize)]
-struct Answer {
+struct About {
     torch: String,
     device: String,
     threads: u32,
-    rows: Vec<PeerRow>,
+    steps: Vec<String>,
 }
 
-/// PyTorch on this machine.
+/// PyTorch on a device, with networks of one width.
 pub struct Peer {
-    python: String,
-    devices: Vec<&'static str>,
+    /// `cpu` or `cuda`.
+    pub device: &'static str,
+    /// What it runs on, in words.
+    pub runs_on: String,
+    /// Names of its steps: `pose step` or `training step`, then a comma and `as released` (f evaluated again for the sum) or `kept` (once).
+    pub steps: Vec<String>,
+    process: Child,
+    questions: Option<ChildStdin>,
+    answers: BufReader<ChildStdout>,
 }
 
 impl Peer {
-    /// The interpreter that `PYTHON` names, else `python3`; `None` where that has no PyTorch.
-    pub fn find() -> Option<Self> {
+    /// One for each device that PyTorch has here, with the interpreter that `PYTHON` names, else `python3`; none where that has no PyTorch.
+    pub fn start(width: u32) -> Result<Vec<Self>, Box<dyn Error>> {
         let python = std::env::var("PYTHON").unwrap_or("python3".into());
         let code = "import torch; print(torch.cuda.is_available())";
-        let output = Command::new(&python).args(["-c", code]).stderr(Stdio::null()).output().ok()?;
-        let answer = String::from_utf8_lossy(&output.stdout);
-        let devices = if answer.trim() == "True" { vec!["cpu", "cuda"] } else { vec!["cpu"] };
-        output.status.success().then_some(Peer { python, devices })
+        let output = match Command::new(&python).args(["-c", code]).stderr(Stdio::null()).output() {
+            Ok(output) if output.status.success() => output,
+            _ => return Ok(Vec::new()),
+        };
+        let devices: &[_] = if String::from_utf8_lossy(&output.stdout).trim() == "True" { &["cpu", "cuda"] } else { &["cpu"] };
+        devices.iter().map(|device| Self::on(&python, device, width)).collect()
     }
 
-    /// Times the steps of one width on every device: what PyTorch ran on, and the rows.
-    pub fn time(&self, width: u32) -> Result<(String, Vec<PeerRow>), Box<dyn std::error::Error>> {
+    fn on(python: &str, device: &'static str, width: u32) -> Result<Self, Box<dyn Error>> {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../bench/peer.py");
-        let (mut ran_on, mut all) = (Vec::new(), Vec::new());
-        for &device in &self.devices {
-            // A step of the paper's training takes half a minute on two cores.
-            let runs = if width > 64 && device == "cpu" { "1" } else { "5" };
-            let mut command = Command::new(&self.python);
-            command.arg(&script).args(["time", "--json", "--width", &width.to_string(), "--device", device, "--runs", runs]);
-            let output = command.stderr(Stdio::inherit()).output()?;
-            if !output.status.success() {
-                return Err(format!("{}: {}", script.display(), output.status).into());
-            }
-            let answer: Answer = serde_json::from_slice(&output.stdout)?;
-            ran_on.push(format!("{} (PyTorch {}, {} threads)", answer.device, answer.torch, answer.threads));
-            all.extend(answer.rows.into_iter().map(|row| PeerRow { device: device.into(), ..row }));
+        let mut command = Command::new(python);
+        command.arg(script).args(["serve", "--width", &width.to_string(), "--device", device]);
+        let mut process = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
+        let (questions, answers) = (process.stdin.take(), process.stdout.take().expect("it is piped"));
+        let (runs_on, steps) = (String::new(), Vec::new());
+        let mut peer = Peer { device, runs_on, steps, process, questions, answers: BufReader::new(answers) };
+        let About { torch, device, threads, steps } = serde_json::from_str(&peer.line()?)?;
+        peer.runs_on = format!("{device} (PyTorch {torch}, {threads} threads)");
+        peer.steps = steps;
+        Ok(peer)
+    }
+
+    fn line(&mut self) -> Result<String, Box<dyn Error>> {
+        let mut line = String::new();
+        match self.answers.read_line(&mut line)? {
+            0 => Err(format!("bench/peer.py: {}", self.process.wait()?).into()),
+            _ => Ok(line),
         }
-        Ok((ran_on.join("; "), all))
+    }
+
+    /// Takes one of its steps: seconds.
+    pub fn take(&mut self, step: &str) -> Result<f64, Box<dyn Error>> {
+        writeln!(self.questions.as_mut().expect("they end with the peer"), "{step}")?;
+        Ok(self.line()?.trim().parse()?)
+    }
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        // It ends with its input.
+        self.questions = None;
+        let _ = self.process.wait();
     }
 }
