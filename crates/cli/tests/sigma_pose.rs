@@ -278,6 +278,29 @@ fn a_photo_needs_to_be_explained() {
     fail(dir, &format!("{args} --intrinsics intrinsics.txt --instance 2"), &["photo.png", "90×50", "64×64"]);
 }
 
+/// Whatever the picture says: a model that has learnt from other distances.
+#[test]
+fn a_camera_where_none_has_been_is_not_trusted() {
+    let home = home();
+    let dir = home.path();
+    let mut model = Model::load(&dir.join("model.safetensors")).unwrap();
+    let (sizes, at_truth) = ([].into(), [].into());
+    let (curvature, floor, unexplained) = (1.0, [1.0; 6], 1e9);
+    let calibration = Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth: 1.0, rival: -9.0, views: 9 };
+    model.metadata.calibration = Some(calibration);
+    let args = format!("estimate DATA/{CHICKEN} --model model.safetensors --steps 3 --effort fast --executor cpu");
+    for (distances, doubt) in [([0.01, 99.0], None), ([98.0, 99.0], Some("distance"))] {
+        model.metadata.distances = Some(distances);
+        model.save(&dir.join("model.safetensors")).unwrap();
+        let report: Value = serde_json::from_str(&run(dir, &format!("{args} --json"), doubt.map_or(0, |_| 1))).unwrap();
+        let image = &report["images"][0];
+        assert_eq!((image["trusted"].as_bool(), image["doubt"].as_str()), (Some(doubt.is_none()), doubt));
+    }
+    assert!(run(dir, &args, 1).contains("DO NOT TRUST: nearer or farther"));
+    // Who says what to accept decides alone.
+    run(dir, &format!("{args} --accept 1e9"), 0);
+}
+
 /// Colours so large that no loss is finite: no pose, no panic, also not in the pictures.
 #[test]
 fn a_search_that_blows_up_is_not_trusted() {

@@ -195,7 +195,8 @@ fn training_learns_and_writes_what_a_person_wants_to_see() {
     let model = Model::load(&run.join("model.safetensors")).unwrap();
     assert!(model.layout.density.is_none() && model.layout.features() == 16);
     assert_eq!((model.metadata.side, model.metadata.instance_names.len()), (Some(16), 9));
-    assert!((model.metadata.orbit_radius.unwrap() - 1.3).abs() < 1e-3);
+    let [nearest, farthest] = model.metadata.distances.unwrap();
+    assert!([nearest, model.metadata.orbit_radius.unwrap(), farthest].iter().all(|distance| (distance - 1.3).abs() < 1e-3));
 }
 
 #[test]

@@ -46,15 +46,45 @@ pub struct Calibration {
     pub views: u32,
 }
 
+/// Why an estimate is not to be trusted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Doubt {
+    /// The loss is no number.
+    Loss,
+    /// It leaves more of the picture unexplained than true poses do.
+    Unexplained,
+    /// The camera is nearer to the object, or farther from it, than any that the model has learnt from, see [`Metadata::distances`](crate::Metadata):
+    /// from close by, a part of one surface explains any picture of one colour, and what the network shows there is a guess.
+    Distance,
+    /// A pose elsewhere explains the picture nearly as well.
+    Rival,
+}
+
+impl std::fmt::Display for Doubt {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Doubt::Loss => "the loss is no number",
+            Doubt::Unexplained => "too much is unexplained",
+            Doubt::Distance => "nearer or farther than the model has learnt",
+            Doubt::Rival => "another pose does nearly as well",
+        })
+    }
+}
+
 impl Calibration {
-    /// Whether an estimate of this instance is to be trusted, by what it leaves unexplained and by its rival, if there is one. An instance that
+    /// Why an estimate of this instance is not to be trusted, by what it leaves unexplained and by its rival, if there is one. An instance that
     /// is not in `at_truth` is taken for one as good as half of those that are.
-    pub fn trusts(&self, instance: &str, unexplained: f64, rival_higher: Option<f64>) -> bool {
+    pub fn doubt(&self, instance: &str, unexplained: f64, rival_higher: Option<f64>) -> Option<Doubt> {
         let mut all: Vec<f64> = self.at_truth.values().copied().collect();
         all.sort_by(f64::total_cmp);
         let most = self.at_truth.get(instance).or(all.get(all.len() / 2));
-        let is_explained = most.is_none_or(|most| unexplained <= self.above_truth * most);
-        unexplained <= self.unexplained && is_explained && rival_higher.is_none_or(|higher| higher >= self.rival)
+        let is_explained = unexplained <= self.unexplained && most.is_none_or(|most| unexplained <= self.above_truth * most);
+        match rival_higher {
+            _ if !is_explained => Some(Doubt::Unexplained),
+            Some(higher) if higher < self.rival => Some(Doubt::Rival),
+            _ => None,
+        }
     }
 }
 
@@ -264,12 +294,13 @@ mod tests {
         let cases =
             [("well", 0.14, true), ("well", 0.16, false), ("badly", 0.7, true), ("new", 0.29, true), ("new", 0.31, false)];
         for (instance, unexplained, trusted) in cases {
-            assert_eq!(known.trusts(instance, unexplained, None), trusted, "{instance} {unexplained}");
+            let doubt = (!trusted).then_some(Doubt::Unexplained);
+            assert_eq!(known.doubt(instance, unexplained, None), doubt, "{instance} {unexplained}");
         }
-        assert!(known.trusts("well", 0.1, Some(0.2)) && !known.trusts("well", 0.1, Some(0.05)));
-        assert!(!known.trusts("well", f64::NAN, None));
+        assert_eq!([0.2, 0.05].map(|higher| known.doubt("well", 0.1, Some(higher))), [None, Some(Doubt::Rival)]);
+        assert_eq!(known.doubt("well", f64::NAN, Some(0.05)), Some(Doubt::Unexplained));
         let old = Calibration { at_truth: BTreeMap::new(), ..known };
-        assert!(old.trusts("well", 0.8, None) && !old.trusts("well", 1.0, None));
+        assert_eq!([0.8, 1.0].map(|part| old.doubt("well", part, None)), [None, Some(Doubt::Unexplained)]);
     }
 
     fn calibration(curvature: f64, floor: [f64; 6]) -> Calibration {

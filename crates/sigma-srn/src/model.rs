@@ -142,8 +142,24 @@ pub struct Metadata {
     pub side: Option<u32>,
     /// Distance of the training cameras from the origin in object units, if known.
     pub orbit_radius: Option<f64>,
+    /// The nearest and the farthest of the training cameras, but for a hundredth on each side, in object units, if known.
+    pub distances: Option<[f64; 2]>,
     /// How its estimates compare with known poses, if that was measured.
     pub calibration: Option<Calibration>,
+}
+
+/// How much nearer, or farther, than all training cameras a camera may be for the model to know what it sees.
+const BEYOND: f64 = 1.1;
+/// The same beside the one distance that is known of all of them.
+const BEYOND_RADIUS: f64 = 1.25;
+
+impl Metadata {
+    /// Whether the model has learnt from cameras about as far from the object's centre as this one; true where it does not say from which.
+    pub fn knows_distance(&self, distance: f64) -> bool {
+        let radius = self.orbit_radius.map(|radius| [radius / BEYOND_RADIUS, radius * BEYOND_RADIUS]);
+        let range = self.distances.map(|[nearest, farthest]| [nearest / BEYOND, farthest * BEYOND]).or(radius);
+        range.is_none_or(|[nearest, farthest]| nearest <= distance && distance <= farthest)
+    }
 }
 
 /// Where the shapes of a layout come from: a file's tensors, or a configuration.
@@ -396,6 +412,7 @@ impl Model {
             instance_names: instance_names.unwrap_or_default(),
             side: number("side").and_then(Result::ok).map(|side| side as u32),
             orbit_radius: number("orbit_radius").and_then(Result::ok),
+            distances: serde_json::from_str(json("distances")).map_err(|error| wrong("distances", error))?,
             calibration: serde_json::from_str(json("calibration")).map_err(|error| wrong("calibration", error))?,
         };
         Self::from_tensors(&tensors, tracing_steps, metadata)
@@ -487,6 +504,9 @@ impl Model {
         }
         if let Some(radius) = self.metadata.orbit_radius {
             text.insert("orbit_radius".into(), radius.to_string());
+        }
+        if let Some(distances) = self.metadata.distances {
+            text.insert("distances".into(), serde_json::json!(distances).to_string());
         }
         if let Some(calibration) = &self.metadata.calibration {
             text.insert("calibration".into(), serde_json::json!(calibration).to_string());

@@ -1,7 +1,7 @@
 //! Model files that are not as they should be.
 
 use proptest::prelude::*;
-use sigma_srn::{Model, ModelConfig};
+use sigma_srn::{Metadata, Model, ModelConfig};
 use std::path::Path;
 
 #[path = "../../data/tests/spoil/mod.rs"]
@@ -14,6 +14,7 @@ fn fuzz_model() {
     let path = dir.path().join("model.safetensors");
     let mut model = Model::init(&config, 1).unwrap();
     model.metadata.instance_names = vec!["a".into(), "b".into()];
+    model.metadata.distances = Some([1.1, 1.5]);
     model.save(&path).unwrap();
     let good = std::fs::read(&path).unwrap();
     assert_eq!(Model::load(&path).unwrap(), model);
@@ -29,4 +30,14 @@ fn fuzz_model() {
         }
         Ok(())
     });
+}
+
+#[test]
+fn a_model_knows_how_far_away_its_cameras_were() {
+    let known = |metadata: Metadata| [0.5, 0.99, 1.01, 1.6, 1.7].map(|distance| metadata.knows_distance(distance));
+    let orbit_radius = Some(1.3);
+    let distances = Some([1.1, 1.5]);
+    assert_eq!(known(Metadata { orbit_radius, distances, ..Metadata::default() }), [false, false, true, true, false]);
+    assert_eq!(known(Metadata { orbit_radius, ..Metadata::default() }), [false, false, false, true, false]);
+    assert_eq!(known(Metadata::default()), [true; 5]);
 }

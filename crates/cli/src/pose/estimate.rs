@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::{Engine, Model, Pose6};
+use sigma_srn::{Doubt, Engine, Model, Pose6};
 use srn_data::camera::Axes;
 
 use super::files::{ObjectArgs, Picture, PoseSource, create_dir, mask_of, model_side, srn_instance};
@@ -92,6 +92,8 @@ struct ImageReport {
     /// See [`Found::unexplained`].
     unexplained: f64,
     trusted: bool,
+    /// Why it is not to be trusted.
+    doubt: Option<Doubt>,
     /// If the model is calibrated.
     confidence: Option<Confidence>,
     /// The best pose elsewhere that the search followed to the end.
@@ -156,7 +158,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
         let found = unseen(args, on, &pictures, &starts)?;
         let names = vec!["unseen".to_string(); pictures.len()];
         report(args, &engine, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
-        return Ok(found.iter().all(|found| found.trusted));
+        return Ok(found.iter().all(Found::is_trusted));
     }
 
     let bar = progress(options.phases.iter().map(|phase| u64::from(phase.steps)).sum(), "steps");
@@ -180,7 +182,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
         }
         eprintln!("pictures in {}", dir.display());
     }
-    Ok(found.iter().all(|found| found.trusted))
+    Ok(found.iter().all(Found::is_trusted))
 }
 
 /// Poses of objects that are not in the model.
@@ -267,7 +269,8 @@ fn report(
             translation: [x, y, z],
             loss: found.estimate.loss,
             unexplained: found.unexplained,
-            trusted: found.trusted,
+            trusted: found.is_trusted(),
+            doubt: found.doubt,
             confidence: found.confidence,
             rival: found.estimate.rival().map(rival),
             searches: found.searches,
@@ -300,7 +303,7 @@ impl ImageReport {
     fn line(&self, pose: &Pose6) -> String {
         let [a, b, c, x, y, z] = pose.0;
         let [a, b, c] = [a, b, c].map(f64::to_degrees);
-        let verdict = if self.trusted { "" } else { "  DO NOT TRUST" };
+        let verdict = self.doubt.map_or(String::new(), |doubt| format!("  DO NOT TRUST: {doubt}"));
         let deviation = self.confidence.map_or(String::new(), |c| format!("  ± {:.2}° {:.4}", c.rotation_deg, c.translation));
         let error = self.error.map_or(String::new(), |error| format!("  error {error}"));
         format!(

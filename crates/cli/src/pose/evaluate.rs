@@ -196,7 +196,7 @@ pub(super) fn view_report(
         start: found.estimate.ranking[0].start,
         loss: found.estimate.loss,
         unexplained: found.unexplained,
-        trusted: found.trusted,
+        trusted: found.is_trusted(),
         confidence: found.confidence,
         within_95,
         rival_higher: found.estimate.rival().map(|(_, higher)| higher),

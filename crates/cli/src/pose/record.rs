@@ -164,7 +164,7 @@ impl Page<'_> {
         let top = 52 + 16 * scale;
         let below = top + shown + 6;
         let mut page = sheet::blank(width, below + 36 + plot_height);
-        let verdict = if self.found.trusted { "pose found" } else { "not to be trusted" };
+        let verdict = if self.found.is_trusted() { "pose found" } else { "not to be trusted" };
         sheet::title(&mut page, GAP as i32, 12, &format!("{}: {verdict}", self.picture.name), scale, BLACK);
         let ranking = &self.found.estimate.ranking;
         let mut line = format!("start {} of {}", ranking[0].start, ranking.len());

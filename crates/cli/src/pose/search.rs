@@ -10,8 +10,8 @@ use serde::Serialize;
 use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
 use sigma_srn::confidence::deviations;
 use sigma_srn::{
-    Calibration, Effort, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer, Rendering,
-    Unseen, estimate, estimate_unseen,
+    Calibration, Doubt, Effort, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer,
+    Rendering, Unseen, estimate, estimate_unseen,
 };
 
 use super::files::Picture;
@@ -73,7 +73,8 @@ pub struct SearchArgs {
     seed: u64,
     /// A pose is trusted if the view from there leaves at most this part of the picture unexplained: the sum of absolute differences, over
     /// that to an empty picture. Default: what `calibrate` has found for the model, else 0.25. With the default, what looks alike from two
-    /// sides is not trusted either if `calibrate` saw the search mistake them, or if the object is not one of the model's.
+    /// sides is not trusted either if `calibrate` saw the search mistake them, or if the object is not one of the model's, nor is a camera
+    /// that is nearer or farther than those that the model has learnt from.
     #[arg(long, value_name = "X", value_parser = positive)]
     accept: Option<f64>,
     /// Distance of the starts of `around84` and `fixed24` from the object's centre, in object units. Default: by the size of the object in a
@@ -242,7 +243,7 @@ impl SearchArgs {
         let mut all = self.run(&options, on, pictures, starts, |progress| observe(0, progress))?;
         let is_normal = options == Options { seed: self.seed, ..Options::of(Effort::Normal) };
         let exhaustive = Options { seed: self.seed, ..Options::of(Effort::Exhaustive) };
-        for (i, found) in all.iter_mut().enumerate().filter(|(_, found)| is_normal && !found.trusted) {
+        for (i, found) in all.iter_mut().enumerate().filter(|(_, found)| is_normal && !found.is_trusted()) {
             let mut again = self.run(&exhaustive, on, &pictures[i..=i], &starts[i..=i], |progress| {
                 let hypotheses: Vec<_> = progress.hypotheses.iter().map(|(_, start)| (i, *start)).collect();
                 observe(1, Progress { hypotheses: &hypotheses, ..progress })
@@ -275,39 +276,52 @@ impl SearchArgs {
         let view = (0, estimate.pose.to_matrix(), picture.intrinsics);
         let render = render(On { model: &fitted, ..on }, &[view])?.swap_remove(0);
         let found = self.found(&fitted, picture, estimate, render, seconds);
-        Ok((Found { trusted: self.trusts_unseen(model, &found), ..found }, fitted))
+        Ok((Found { doubt: self.doubt_unseen(model, &found), ..found }, fitted))
     }
 
     fn found(&self, model: &Model, picture: &Picture, estimate: Estimate, render: Rendering, seconds: f64) -> Found {
         let unexplained = unexplained(picture, &render.rgb);
-        let trusted = self.trusts(model, picture.instance, &estimate, unexplained);
+        let doubt = self.doubt(model, picture.instance, &estimate, unexplained);
         let calibration = model.metadata.calibration.as_ref();
         let instance = model.instance_name(picture.instance);
         let confidence = calibration.and_then(|calibration| Confidence::of(&estimate, &instance, calibration));
         let world_from_camera = estimate.pose.to_matrix();
-        Found { world_from_camera, estimate, rgb: render.rgb, unexplained, trusted, confidence, searches: 1, seconds }
+        Found { world_from_camera, estimate, rgb: render.rgb, unexplained, doubt, confidence, searches: 1, seconds }
     }
 
-    /// Whether an estimate is to be trusted.
-    fn trusts(&self, model: &Model, instance: u32, estimate: &Estimate, unexplained: f64) -> bool {
-        let explains = |most: f64| estimate.loss.is_finite() && unexplained <= most;
-        match (self.accept, &model.metadata.calibration) {
-            (Some(most), _) => explains(most),
-            (None, Some(calibration)) => {
-                let rival = estimate.rival().map(|(_, higher)| higher);
-                estimate.loss.is_finite() && calibration.trusts(&model.instance_name(instance), unexplained, rival)
-            }
-            (None, None) => explains(ACCEPT),
-        }
+    /// Why an estimate is not to be trusted.
+    fn doubt(&self, model: &Model, instance: u32, estimate: &Estimate, unexplained: f64) -> Option<Doubt> {
+        self.doubt_with(model, estimate, |rival| match &model.metadata.calibration {
+            Some(calibration) if self.accept.is_none() => calibration.doubt(&model.instance_name(instance), unexplained, rival),
+            _ => unexplained_doubt(unexplained, self.accept.unwrap_or(ACCEPT)),
+        })
     }
 
     /// The same for an object that the model was not trained on: its code bends to the picture at a wrong pose too, so what matters more than
     /// what is unexplained is whether the other known objects that it began with led to the same pose.
-    fn trusts_unseen(&self, model: &Model, found: &Found) -> bool {
-        let most =
-            self.accept.or(model.metadata.calibration.as_ref().map(|calibration| calibration.unexplained)).unwrap_or(ACCEPT);
-        let is_alone = self.accept.is_some() || found.estimate.rival().is_none_or(|(_, higher)| higher >= UNSEEN_RIVAL);
-        found.estimate.loss.is_finite() && found.unexplained <= most && is_alone
+    fn doubt_unseen(&self, model: &Model, found: &Found) -> Option<Doubt> {
+        self.doubt_with(model, &found.estimate, |rival| {
+            let learnt = model.metadata.calibration.as_ref().map(|calibration| calibration.unexplained);
+            let has_rival = self.accept.is_none() && rival.is_some_and(|higher| higher < UNSEEN_RIVAL);
+            unexplained_doubt(found.unexplained, self.accept.or(learnt).unwrap_or(ACCEPT)).or(has_rival.then_some(Doubt::Rival))
+        })
+    }
+
+    /// What every estimate must be, beside what `picture` says, which is told how much worse the rival is: a number, and seen from where the
+    /// model has learnt, unless `--accept` decides alone.
+    fn doubt_with(
+        &self,
+        model: &Model,
+        estimate: &Estimate,
+        picture: impl FnOnce(Option<f64>) -> Option<Doubt>,
+    ) -> Option<Doubt> {
+        let distance = estimate.pose.to_matrix().w_axis.truncate().length();
+        let is_far = self.accept.is_none() && !model.metadata.knows_distance(distance);
+        match picture(estimate.rival().map(|(_, higher)| higher)) {
+            _ if !estimate.loss.is_finite() => Some(Doubt::Loss),
+            None | Some(Doubt::Rival) if is_far => Some(Doubt::Distance),
+            doubt => doubt,
+        }
     }
 
     /// Starts all around the object, turned so that it appears in the middle of the picture: a cut may lie anywhere beside the
@@ -344,6 +358,11 @@ impl SearchArgs {
     }
 }
 
+/// The doubt where more than `most` of a picture is unexplained, also where that is no number.
+fn unexplained_doubt(unexplained: f64, most: f64) -> Option<Doubt> {
+    (unexplained.is_nan() || unexplained > most).then_some(Doubt::Unexplained)
+}
+
 fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
     Query {
         instance: picture.instance,
@@ -368,14 +387,21 @@ pub struct Found {
     /// The part of the picture that the render leaves unexplained: the sum of absolute differences to the render, over that to
     /// an empty (white) picture, of the pixels that count. 0: equal; 1: no better than nothing.
     pub unexplained: f64,
-    /// Whether the loss is finite, that is little enough, and no pose elsewhere does nearly as well.
-    pub trusted: bool,
+    /// Why it is not to be trusted, if it is not.
+    pub doubt: Option<Doubt>,
     /// How far off the pose may be, if the model is calibrated.
     pub confidence: Option<Confidence>,
     /// Which search this is the end of, see [`SearchArgs::run_until_trusted`].
     pub searches: usize,
     /// Seconds of all searches, a picture's share of their batch.
     pub seconds: f64,
+}
+
+impl Found {
+    /// Whether there is no doubt.
+    pub fn is_trusted(&self) -> bool {
+        self.doubt.is_none()
+    }
 }
 
 /// How far off a pose may be, provided that it is no other one altogether.

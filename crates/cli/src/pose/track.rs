@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::{Options, Phase, Pose6};
+use sigma_srn::{Doubt, Options, Phase, Pose6};
 
 use super::draw;
 use super::files::{ObjectArgs, Picture, PoseSource, mask_of, model_side, write_gif};
@@ -62,6 +62,8 @@ struct FrameReport<'a> {
     loss: f64,
     unexplained: f64,
     trusted: bool,
+    /// Why it is not to be trusted.
+    doubt: Option<Doubt>,
     confidence: Option<Confidence>,
     /// The pose is not from that of the frame before, but was searched for all around.
     searched: bool,
@@ -106,18 +108,20 @@ pub fn run(args: &Track) -> Result<bool> {
             // It stands still, or goes on as it did.
             [last, earlier, ..] => Some(run(&from_frame_to_frame, vec![last, last * earlier.inverse() * last])?),
         };
-        let searched = followed.as_ref().is_none_or(|found| !found.trusted);
-        let found = match followed.filter(|found| found.trusted) {
+        // An object that goes too near or too far away is followed all the same.
+        let followed = followed.filter(|found| matches!(found.doubt, None | Some(Doubt::Distance)));
+        let searched = followed.is_none();
+        let found = match followed {
             Some(found) => found,
             None => {
                 let starts = args.search.starts(&Starts::Around84, &model, &picture, side, None, &notation)?;
                 run(&all_around, starts)?
             }
         };
-        trusted = found.trusted;
+        trusted = found.is_trusted();
         before.truncate(if searched { 0 } else { 1 });
-        // What is not to be trusted is no place to go on from.
-        if trusted {
+        // Else what is not to be trusted is no place to go on from.
+        if trusted || !searched {
             before.insert(0, found.world_from_camera);
         }
         let truth = args.truth.as_ref().map(|truth| truth.read(path, &notation)).transpose()?;
@@ -134,6 +138,7 @@ pub fn run(args: &Track) -> Result<bool> {
             loss: found.estimate.loss,
             unexplained: found.unexplained,
             trusted,
+            doubt: found.doubt,
             confidence: found.confidence,
             searched,
             error,
@@ -197,7 +202,7 @@ impl FrameReport<'_> {
         let deviation = self.confidence.map_or(String::new(), |c| format!("  ± {:.2}° {:.4}", c.rotation_deg, c.translation));
         let error = self.error.map_or(String::new(), |error| format!("  error {error}"));
         let searched = if self.searched { "  searched all around" } else { "" };
-        let verdict = if self.trusted { "" } else { "  DO NOT TRUST" };
+        let verdict = self.doubt.map_or(String::new(), |doubt| format!("  DO NOT TRUST: {doubt}"));
         format!(
             "{}  rotation {a:.2}° {b:.2}° {c:.2}°  centre {x:.4} {y:.4} {z:.4}{deviation}  unexplained {:.0} %  {:.2} s{error}{searched}{verdict}",
             self.frame.display(),

@@ -85,8 +85,14 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         Some(from) => begin_with(if has_checkpoint { &checkpoint } else { &from }, &mut settings, &instance_names)?,
         None => Model::init(&settings.model(), settings.seed)?,
     };
-    let orbit_radius = median_distance(&set);
-    model.metadata = Metadata { instance_names, side: Some(settings.side), orbit_radius: Some(orbit_radius), calibration: None };
+    let (orbit_radius, distances) = distances(&set);
+    model.metadata = Metadata {
+        instance_names,
+        side: Some(settings.side),
+        orbit_radius: Some(orbit_radius),
+        distances: Some(distances),
+        calibration: None,
+    };
     let mut trainer = Trainer::new(&engine, model, Train::Everything, settings.batch, settings.rays)?;
     if has_checkpoint {
         trainer.load_checkpoint(&checkpoint)?;
@@ -212,12 +218,14 @@ fn watched_views<'a>(set: &'a Dataset, validation: Option<&'a Dataset>, count: u
         .collect()
 }
 
-/// Median distance of the cameras to the origin.
-fn median_distance(set: &Dataset) -> f64 {
+/// Distances of the cameras to the origin: the median, and the nearest and the farthest.
+fn distances(set: &Dataset) -> (f64, [f64; 2]) {
     let cameras = set.instances.iter().flat_map(|instance| &instance.views).map(common::camera);
     let mut distances: Vec<f64> = cameras.map(|(pose, _)| pose.w_axis.truncate().length()).collect();
     distances.sort_by(f64::total_cmp);
-    distances[distances.len() / 2]
+    // One camera in a hundred may be a mistake.
+    let few = distances.len() / 100;
+    (distances[distances.len() / 2], [distances[few], distances[distances.len() - 1 - few]])
 }
 
 /// Mean PSNR over the views, and a picture of them: target, rendering and depth side by side.

@@ -48,7 +48,7 @@ pub fn import(args: &ImportArgs) -> Result<bool> {
         }
         None => vec![],
     };
-    let metadata = Metadata { instance_names, side: Some(args.side), orbit_radius: Some(args.radius), calibration: None };
+    let metadata = Metadata { instance_names, side: Some(args.side), orbit_radius: Some(args.radius), ..Metadata::default() };
     let (model, left_out) = Model::load_torch(&args.checkpoint, args.tracing_steps, metadata)
         .map_err(|error| about_model(&args.checkpoint, error))?;
     model.save(&args.out)?;
