@@ -29,7 +29,7 @@ const SMALL_BUDGET: u64 = 256 << 20;
 const ALONE_ROWS: u32 = 4096;
 /// Turns of works that take tenths of a second, which are disturbed more, and of longer ones; and seconds from which one turn must do.
 const MANY_TURNS: usize = 9;
-const TURNS: usize = 5;
+const TURNS: usize = 3;
 const LONG: f64 = 30.0;
 /// Hypotheses and side of the image, from one to the other end of what is asked for.
 const SCALING: [(u32, u32); 8] = [(5, 16), (5, 32), (5, 64), (5, 128), (1, 32), (5, 32), (24, 32), (120, 32)];
