@@ -16,6 +16,7 @@ struct Params {
     seed: f32,
     scale: f32,
     soft: f32,
+    sphere: f32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -45,6 +46,7 @@ fn main(
     let column0 = vec3(world_from_camera[w], world_from_camera[w + 4u], world_from_camera[w + 8u]);
     let column1 = vec3(world_from_camera[w + 1u], world_from_camera[w + 5u], world_from_camera[w + 9u]);
     let column2 = vec3(world_from_camera[w + 2u], world_from_camera[w + 6u], world_from_camera[w + 10u]);
+    let t = vec3(world_from_camera[w + 3u], world_from_camera[w + 7u], world_from_camera[w + 11u]);
 
     var sums: array<f32, 27>;
     for (var r = first; r < end; r++) {
@@ -56,11 +58,12 @@ fn main(
 
         let d_o = vec3(d_origin[at], d_origin[at + 1u], d_origin[at + 2u]) / params.seed;
         let d_d = vec3(d_direction[at], d_direction[at + 1u], d_direction[at + 2u]) / params.seed;
-        let turn = cross(vec3(origin[at], origin[at + 1u], origin[at + 2u]), d_o)
-            + cross(vec3(direction[at], direction[at + 1u], direction[at + 2u]), d_d);
+        let ray = vec3(direction[at], direction[at + 1u], direction[at + 2u]);
+        let turn = cross(vec3(origin[at], origin[at + 1u], origin[at + 2u]), d_o) + cross(ray, d_d);
+        let shift = d_o + dot(d_o, ray) * ray_beginning(t, ray, params.sphere).d_eye;
         let jacobian = array(
             dot(column0, turn), dot(column1, turn), dot(column2, turn),
-            dot(column0, d_o), dot(column1, d_o), dot(column2, d_o),
+            dot(column0, shift), dot(column1, shift), dot(column2, shift),
         );
         var k = 0u;
         for (var a = 0u; a < 6u; a++) {

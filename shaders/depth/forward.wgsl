@@ -7,8 +7,6 @@ struct Params {
     groups: u32,
     rows_per_group: u32,
     first_group: u32,
-    chunk_rows: u32,
-    chunks: u32,
     scale: f32,
 }
 

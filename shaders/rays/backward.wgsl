@@ -1,4 +1,4 @@
-// ray = R q, d_ray = z0 d_origin + (d_direction - direction ⟨direction, d_direction⟩) / ‖ray‖; d_R = Σ d_ray qᵀ, d_t = Σ d_origin.
+// d_t = Σ d_origin + ⟨d_origin, direction⟩ ∂s/∂t, d_R = Σ d_ray qᵀ: d_ray = z0 d_origin + (1 - direction directionᵀ) (d_direction + s d_origin + ⟨d_origin, direction⟩ ∂s/∂direction) / ‖R q‖.
 // One invocation sums one chunk of the rows of one image.
 // world_from_camera [images, 12], intrinsics [images, 4], uv [rows, 2], z0 [rows], d_origin, d_direction [rows, 3] → partial [groups, chunks, 12].
 // OVERWRITES partial.
@@ -9,7 +9,7 @@ struct Params {
     first_group: u32,
     chunk_rows: u32,
     chunks: u32,
-    scale: f32,
+    sphere: f32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -40,6 +40,7 @@ fn main(
     let column0 = vec3(world_from_camera[w], world_from_camera[w + 4u], world_from_camera[w + 8u]);
     let column1 = vec3(world_from_camera[w + 1u], world_from_camera[w + 5u], world_from_camera[w + 9u]);
     let column2 = vec3(world_from_camera[w + 2u], world_from_camera[w + 6u], world_from_camera[w + 10u]);
+    let t = vec3(world_from_camera[w + 3u], world_from_camera[w + 7u], world_from_camera[w + 11u]);
     let focal = vec2(intrinsics[k], intrinsics[k + 1u]);
     let centre = vec2(intrinsics[k + 2u], intrinsics[k + 3u]);
 
@@ -55,12 +56,15 @@ fn main(
         let norm = length(ray);
         let direction = ray / norm;
         let d_o = vec3(d_origin[3u * row], d_origin[3u * row + 1u], d_origin[3u * row + 2u]);
-        let d_d = vec3(d_direction[3u * row], d_direction[3u * row + 1u], d_direction[3u * row + 2u]);
+        let begins = ray_beginning(t, direction, params.sphere);
+        let d_s = dot(d_o, direction);
+        let d_d = vec3(d_direction[3u * row], d_direction[3u * row + 1u], d_direction[3u * row + 2u])
+            + begins.distance * d_o + d_s * begins.d_direction;
         let d_ray = z0[row] * d_o + (d_d - direction * dot(direction, d_d)) / norm;
         d_column0 += d_ray * q.x;
         d_column1 += d_ray * q.y;
         d_column2 += d_ray;
-        d_t += d_o;
+        d_t += d_o + d_s * begins.d_eye;
     }
     for (var a = 0u; a < 3u; a++) {
         let at = 12u * index + 4u * a;

@@ -1,4 +1,4 @@
-// q = ((u - cx) / fx, (v - cy) / fy, 1), direction = normalize(R q), origin = t + R (z0 q).
+// q = ((u - cx) / fx, (v - cy) / fy, 1), direction = normalize(R q), origin = t + s direction + R (z0 q), s to the sphere of radius `sphere`.
 // One invocation computes one row (one ray).
 // world_from_camera [images, 12], intrinsics [images, 4] = (fx, fy, cx, cy), uv [rows, 2], z0 [rows] → origin, direction [rows, 3].
 // OVERWRITES origin and direction.
@@ -9,7 +9,7 @@ struct Params {
     first_group: u32,
     chunk_rows: u32,
     chunks: u32,
-    scale: f32,
+    sphere: f32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -44,8 +44,8 @@ fn main(
         + vec3(world_from_camera[w + 2u], world_from_camera[w + 6u], world_from_camera[w + 10u]);
     let t = vec3(world_from_camera[w + 3u], world_from_camera[w + 7u], world_from_camera[w + 11u]);
 
-    let x0 = t + z0[row] * ray;
     let d = ray / length(ray);
+    let x0 = t + z0[row] * ray + ray_beginning(t, d, params.sphere).distance * d;
     for (var a = 0u; a < 3u; a++) {
         origin[3u * row + a] = x0[a];
         direction[3u * row + a] = d[a];

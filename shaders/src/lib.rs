@@ -133,6 +133,8 @@ pub fn find(name: &str) -> Option<&'static Kernel> {
 pub const COMMON: &str = concat!(
     include_str!("../common/index.wgsl"),
     "\n",
+    include_str!("../common/ray_sphere.wgsl"),
+    "\n",
     include_str!("../common/activation.wgsl"),
     "\n",
     include_str!("../common/image_loss.wgsl"),

@@ -61,19 +61,30 @@ params! {
         /// Number of poses.
         poses: u32,
     }
-    /// `rays/*`, `depth/*`: rows of a tile and the images they belong to.
-    RowsParams {
+    /// `rays/*`: rows of a tile and the images they belong to.
+    RaysParams {
         /// Images in this tile.
         groups: u32,
         /// Rows of each image in this tile.
         rows_per_group: u32,
         /// Number of the tile's first image.
         first_group: u32,
-        /// Rows per partial sum (`rays/backward`).
+        /// Rows per partial sum (`backward`).
         chunk_rows: u32,
-        /// Partial sums per image (`rays/backward`): `ceil(rows_per_group / chunk_rows)`.
+        /// Partial sums per image (`backward`): `ceil(rows_per_group / chunk_rows)`.
         chunks: u32,
-        /// Factor on the gradient (`depth/backward`).
+        /// Radius of the sphere on which rays begin; 0: they begin at the camera.
+        sphere: f32,
+    }
+    /// `depth/*`: rows of a tile and the images they belong to.
+    DepthParams {
+        /// Images in this tile.
+        groups: u32,
+        /// Rows of each image in this tile.
+        rows_per_group: u32,
+        /// Number of the tile's first image.
+        first_group: u32,
+        /// Factor on the gradient (`backward`).
         scale: f32,
     }
     /// `tile/*`: which rows of the whole batch a tile holds.
@@ -279,6 +290,8 @@ params! {
         scale: f32,
         /// Residual at which the loss turns from squares to absolute values.
         soft: f32,
+        /// Radius of the sphere on which rays begin; 0: they begin at the camera.
+        sphere: f32,
     }
     /// `pack_rgba8/forward`.
     PackParams {

@@ -61,12 +61,13 @@ table! {
     /// Chain rule from `d_world_from_camera [B,12]` to the six numbers `d_pose6 [B,6]`.
     POSE_BACKWARD = "pose"/"backward", PoseParams, tile FLAT,
         (pose6: f32, d_world_from_camera: f32) -> (d_pose6: f32);
-    /// `q = ((u-cx)/fx, (v-cy)/fy, 1)`, `direction = normalize(R q)`, `origin = t + R (z0 q)`.
+    /// `q = ((u-cx)/fx, (v-cy)/fy, 1)`, `direction = normalize(R q)`, `origin = t + s direction + R (z0 q)`, where the line of the ray
+    /// enters the sphere at `t + s direction`; without a sphere `s = 0`.
     /// `world_from_camera [images,12]`, `intrinsics [images,4]` (fx, fy, cx, cy), `uv [rows,2]`, `z0 [rows]` → `origin, direction [rows,3]`.
-    RAYS_FORWARD = "rays"/"forward", RowsParams, tile FLAT,
+    RAYS_FORWARD = "rays"/"forward", RaysParams, tile FLAT,
         (world_from_camera: f32, intrinsics: f32, uv: f32, z0: f32) -> (origin: f32, direction: f32);
     /// Sums each image's rows into `partial [groups, chunks, 12]`, the gradient of `world_from_camera`; `d_origin, d_direction [rows,3]`.
-    RAYS_BACKWARD = "rays"/"backward", RowsParams, tile FLAT,
+    RAYS_BACKWARD = "rays"/"backward", RaysParams, tile FLAT,
         (world_from_camera: f32, intrinsics: f32, uv: f32, z0: f32, d_origin: f32, d_direction: f32) -> (partial: f32);
     /// Copies a tile's rows out of the whole batch: `whole [images · rows_per_image, columns]` → `part [rows, columns]`.
     TILE_GATHER = "tile"/"gather", TileParams, tile FLAT,
@@ -154,10 +155,10 @@ table! {
         (density: f32, feature: f32, d_phi: f32, head: f32) -> (d_density: f32, d_feature: f32, d_hidden: f32),
         or "backward_vec4" tile FLAT, when [FeaturesMultipleOf4];
     /// `depth = R[:,2] · (x - t)`, z in the camera frame: `x [rows,3]` → `depth [rows]`. Extent: rows.
-    DEPTH_FORWARD = "depth"/"forward", RowsParams, tile FLAT,
+    DEPTH_FORWARD = "depth"/"forward", DepthParams, tile FLAT,
         (world_from_camera: f32, x: f32) -> (depth: f32);
     /// Gradient of `scale · Σ min(depth, 0)²` to `d_x [rows,3]`, overwrites. Extent: rows.
-    DEPTH_BACKWARD = "depth"/"backward", RowsParams, tile FLAT,
+    DEPTH_BACKWARD = "depth"/"backward", DepthParams, tile FLAT,
         (world_from_camera: f32, depth: f32) -> (d_x: f32);
     /// `partial[c] = scale · Σ min(depth, 0)²` over chunk `c`. Extent: chunks.
     DEPTH_LOSS_FORWARD = "depth_loss"/"forward", TermParams, tile FLAT,

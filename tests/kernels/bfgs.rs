@@ -18,6 +18,7 @@ pub static EQUATIONS: KernelTest = KernelTest {
         ("equations", "/ params.seed;", ";"),
         ("equations", "dot(column2, turn)", "dot(column1, turn)"),
         ("equations", "cross(vec3(origin", "-cross(vec3(origin"),
+        ("equations", "d_o + dot(d_o, ray)", "d_o - dot(d_o, ray)"),
         ("equations", "weight * e * jacobian[a]", "weight * jacobian[a]"),
         ("equations", "first + params.chunk_rows", "params.chunk_rows"),
         ("equations", "var b = a", "var b = 0u"),
@@ -125,12 +126,12 @@ fn solve_matches_reference() {
 }
 
 fn equations() -> Vec<Case> {
-    ROWS.map(equations_case).into()
+    [0.0, 0.9].into_iter().flat_map(|sphere| ROWS.map(|rows| equations_case(rows, sphere))).collect()
 }
 
 /// The blue channel; images before the first of the tile keep their equations.
-fn equations_case(rows: Rows) -> Case {
-    let mut s = Sketch::new(format!("{rows:?}"));
+fn equations_case(rows: Rows, sphere: f32) -> Case {
+    let mut s = Sketch::new(format!("{rows:?}, sphere {sphere}"));
     let n = 3 * rows.count() as usize;
     let images = (rows.first_group + rows.groups) as usize;
     // Weights from 0.
@@ -142,6 +143,7 @@ fn equations_case(rows: Rows) -> Case {
         direction: s.random("direction", n),
         d_origin: s.random("d_origin", n),
         d_direction: s.random("d_direction", n),
+        sphere,
         rgb: s.random("rgb", n),
         wanted: s.input("wanted", wanted),
     };

@@ -14,7 +14,12 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward", "intrinsics[k + 3u]", "intrinsics[k + 2u]"),
         ("forward", "params.first_group + ", "0u + "),
         ("forward", "ray / length(ray)", "ray"),
-        ("forward", "t + z0[row] * ray", "t + z0[row] * ray / length(ray)"),
+        ("forward", "z0[row] * ray", "z0[row] * d"),
+        ("forward", ".distance * d", ".distance * ray"),
+        ("forward", "eye - along * direction", "eye + along * direction"),
+        ("forward", "max(radius * radius -", "max(radius -"),
+        ("forward", "0.25 * radius * radius", "0.5 * radius * radius"),
+        ("forward", "Beginning(-along - half", "Beginning(-along + half"),
     ],
 };
 
@@ -27,6 +32,13 @@ pub static BACKWARD: KernelTest = KernelTest {
         ("backward", "d_d - direction", "d_d + direction"),
         ("backward", ") / norm;", ");"),
         ("backward", "d_t += d_o", "d_t = d_o"),
+        ("backward", " + d_s * begins.d_eye", ""),
+        ("backward", "+ begins.distance * d_o ", ""),
+        ("backward", "+ d_s * begins.d_direction", ""),
+        ("backward", "change * nearest - direction", "change * nearest"),
+        ("backward", "change * nearest - direction", "-direction"),
+        ("backward", "half > 0.5 * radius", "true"),
+        ("backward", "(1.0 + change * along)", "(1.0 - change * along)"),
         ("backward", "12u * (params.first_group + group)", "12u * group"),
         ("backward", "first + params.chunk_rows", "params.chunk_rows"),
     ],
@@ -43,7 +55,7 @@ fn backward_matches_reference() {
 }
 
 /// Cameras (their matrices need not be rigid here) and pixels of 64 × 64 images.
-fn pixels(s: &mut Sketch, rows: Rows) -> Pixels {
+fn pixels(s: &mut Sketch, rows: Rows, sphere: f32) -> Pixels {
     let images = (rows.first_group + rows.groups) as usize;
     let n = rows.count() as usize;
     let world_from_camera = s.random("world_from_camera", 12 * images);
@@ -52,29 +64,34 @@ fn pixels(s: &mut Sketch, rows: Rows) -> Pixels {
     let uv = s.numbers(2 * n).into_iter().map(|value| 32.0 + 32.0 * value).collect();
     let uv = s.input("uv", uv);
     let z0 = s.random("z0", n);
-    Pixels { world_from_camera, intrinsics, uv, z0 }
+    Pixels { world_from_camera, intrinsics, uv, z0, sphere }
+}
+
+/// Rays that begin at the camera, and on a sphere: cameras are inside and outside of it, and rays meet it or pass it.
+fn all(case: fn(Rows, f32) -> Case) -> Vec<Case> {
+    [0.0, 0.9].into_iter().flat_map(|sphere| ROWS.map(|rows| case(rows, sphere))).collect()
 }
 
 fn forward() -> Vec<Case> {
-    ROWS.map(forward_case).into()
+    all(forward_case)
 }
 
-fn forward_case(rows: Rows) -> Case {
-    let mut s = Sketch::new(format!("{rows:?}"));
-    let pixels = pixels(&mut s, rows);
+fn forward_case(rows: Rows, sphere: f32) -> Case {
+    let mut s = Sketch::new(format!("{rows:?}, sphere {sphere}"));
+    let pixels = pixels(&mut s, rows, sphere);
     let [origin, direction] = ["origin", "direction"].map(|name| s.scratch(name, 3 * rows.count() as usize));
     s.step(|b| rays::forward(b, rows, pixels, origin, direction));
     s.finish()
 }
 
 fn backward() -> Vec<Case> {
-    ROWS.map(backward_case).into()
+    all(backward_case)
 }
 
 /// Images before the first of the tile keep their gradient.
-fn backward_case(rows: Rows) -> Case {
-    let mut s = Sketch::new(format!("{rows:?}"));
-    let pixels = pixels(&mut s, rows);
+fn backward_case(rows: Rows, sphere: f32) -> Case {
+    let mut s = Sketch::new(format!("{rows:?}, sphere {sphere}"));
+    let pixels = pixels(&mut s, rows, sphere);
     let [d_origin, d_direction] = ["d_origin", "d_direction"].map(|name| s.random(name, 3 * rows.count() as usize));
     let partial = s.scratch("partial", rays::partial_len(rows));
     let accumulate = rows.first_group > 0;

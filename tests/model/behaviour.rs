@@ -88,23 +88,50 @@ fn a_run_repeats_bit_for_bit() {
     }
 }
 
+/// What begins on a sphere around the object does not depend on how far along it the camera is.
+#[test]
+fn a_ray_shows_the_same_from_everywhere_on_it() {
+    let mut model = trainer(&Engine::cpu()).model().unwrap().clone();
+    let narrow = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pixel_center: 0.0 };
+    let towards = glam::DVec3::new(0.2, -0.1, 0.3);
+    let cameras = [0.6, 0.9, 1.7, 4.0].map(|distance| {
+        let mut camera = camera::look_at_origin(distance * glam::DVec3::new(0.48, 0.64, 0.6));
+        camera.w_axis += towards.extend(0.0);
+        (camera, narrow)
+    });
+    let spread = |model: &Model, engine: &Engine| {
+        let rgb = Renderer::new(engine, model, 4, 1, 1).unwrap().render(&[0; 4], &cameras, 0).unwrap().rgb;
+        (3..12).map(|k| (rgb[k] - rgb[k % 3]).abs()).fold(0.0, f32::max)
+    };
+    for engine in engines() {
+        model.metadata.ray_sphere = None;
+        let from_cameras = spread(&model, &engine);
+        model.metadata.ray_sphere = Some(1.3);
+        let from_sphere = spread(&model, &engine);
+        println!("{engine}: {from_cameras:.1e} and {from_sphere:.1e}");
+        // Initial depths are drawn for each ray, 5e-4 apart.
+        assert!(from_sphere < 0.02 * from_cameras, "{engine}: {from_cameras} and {from_sphere}");
+    }
+}
+
 /// With the shipped model: what a short training arrives at changes with the last bit of a gradient, and with it where poses lead.
 #[test]
-fn a_pose_near_the_truth_comes_nearer() {
+fn poses_near_the_truth_come_nearer() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../assets/models/compact.safetensors");
     let model = &Model::load(path.as_ref()).unwrap();
     for engine in engines() {
         // Looked for is what the model itself shows: how good it is does not matter here.
-        let truths: Vec<_> = [1, 10, 13].map(|k| camera::fixed24(1.3)[k]).into();
+        let truths = camera::fixed24(1.3);
         let cameras: Vec<_> = truths.iter().map(|truth| (*truth, intrinsics())).collect();
-        let rendering = Renderer::new(&engine, model, 3, SIDE, SIDE).unwrap().render(&[0, 1, 1], &cameras, 0).unwrap();
+        let shown: Vec<u32> = (0..24).map(|k| k % 2).collect();
+        let rendering = Renderer::new(&engine, model, 24, SIDE, SIDE).unwrap().render(&shown, &cameras, 0).unwrap();
 
-        let shape = Shape { hypotheses: 3, width: SIDE, height: SIDE, instances: 2 };
+        let shape = Shape { hypotheses: 24, width: SIDE, height: SIDE, instances: 2 };
         let mut descent = Descent::new(&engine, model, shape, Method::Bfgs { soft: 1.0 }).unwrap();
         let mut rays = Rays::default();
         let mut random = stream(0, 0);
         truths.iter().for_each(|truth| rays.push(truth, &intrinsics(), pixel_grid(SIDE, SIDE, 1), &mut random));
-        descent.set_targets(&[0, 1], &[0, 1, 1], &rays, &rendering.rgb, None).unwrap();
+        descent.set_targets(&[0, 1], &shown, &rays, &rendering.rgb, None).unwrap();
         let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2);
         let starts: Vec<Pose6> = truths.iter().map(|truth| Pose6::from_matrix(&(turn * *truth))).collect();
         descent.set_poses(&starts).unwrap();
@@ -112,12 +139,13 @@ fn a_pose_near_the_truth_comes_nearer() {
             descent.evaluate().unwrap();
             descent.descend().unwrap();
         }
-        for ((best, start), truth) in descent.standing().unwrap().iter().zip(&starts).zip(&truths) {
-            let [before, after] = [start, &best.1].map(|pose| camera::pose_error(&pose.to_matrix(), truth).0);
-            println!("{engine}: {before:.1}° to {after:.2}°");
-            // Measured on both: 0.03° at most.
-            assert!(after < 0.1 * before, "{engine}: {before}° to {after}°");
-        }
+        let ends = descent.standing().unwrap();
+        let error = |(_, pose): &(f64, Pose6), truth| camera::pose_error(&pose.to_matrix(), truth).0;
+        let errors: Vec<f64> = ends.iter().zip(&truths).map(|(end, truth)| error(end, truth)).collect();
+        println!("{engine}: {errors:.2?}");
+        // Some of pictures as small as these lead elsewhere from 11° away. Measured: 17 on the CPU, 14 on llvmpipe.
+        let found = errors.iter().filter(|&&error| error < 1.0).count();
+        assert!(found >= 10, "{engine}: {found} of 24");
     }
 }
 

@@ -70,10 +70,13 @@ fn weights(method: Method, images: u32) -> Option<Vec<f32>> {
     (!gmsd).then(|| (0..images * RAYS).map(|k| [1.0, 0.0, 1.75, 0.5][(k * 31 % 97 % 4) as usize]).collect())
 }
 
-/// A descent from [`poses`], ready to be evaluated; all instances but the first are looked for.
+/// A descent from [`poses`], ready to be evaluated; all instances but the first are looked for. Rays begin on a sphere, which some of them
+/// pass by: that they begin at the camera is tested against golden values.
 fn descent(engine: &Engine, method: Method, hypotheses: u32) -> Descent {
     let shape = Shape { hypotheses, width: SIZE[0], height: SIZE[1], instances: INSTANCES - 1 };
-    let mut descent = Descent::new(engine, &model(true), shape, method).unwrap();
+    let mut model = model(true);
+    model.metadata.ray_sphere = Some(0.6);
+    let mut descent = Descent::new(engine, &model, shape, method).unwrap();
     let batch = batch(hypotheses);
     let instances: Vec<u32> = (1..INSTANCES).collect();
     let slots: Vec<u32> = batch.instances.iter().map(|instance| instance - 1).collect();

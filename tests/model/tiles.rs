@@ -7,9 +7,9 @@ use crate::{RAYS, SIZE, batch, descent, intrinsics, methods, model, poses, train
 
 /// Engines with the largest difference that passes, relative to the largest value of a tensor: other tiles, other order of sums.
 fn engines() -> [(Engine, f64); 3] {
-    // Worst 0 on cpu64 (results are read as f32), 4.7e-6 on cpu (GMSD), 3.4e-5 on llvmpipe (GMSD), where tiles of another size
+    // Worst 0 on cpu64 (results are read as f32), 2.3e-5 on cpu (GMSD), 3.4e-5 on llvmpipe (GMSD), where tiles of another size
     // may run other variants of the kernels.
-    [(Engine::cpu_f64(), 1e-7), (Engine::cpu(), 2e-5), (Engine::gpu(gpu().clone()), 1e-4)]
+    [(Engine::cpu_f64(), 1e-7), (Engine::cpu(), 1e-4), (Engine::gpu(gpu().clone()), 1e-4)]
 }
 
 /// Losses, poses' gradients and colours of a descent after one evaluation.

@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use glam::DMat4;
 use serde_json::Value;
 use sigma_srn::camera::pose_error;
-use sigma_srn::{Calibration, Metadata, Model, ModelConfig};
+use sigma_srn::{Calibration, Metadata, Model, ModelConfig, Seen};
 use tempfile::TempDir;
 
 const TEST: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/dataset/test");
@@ -286,17 +286,20 @@ fn a_camera_where_none_has_been_is_not_trusted() {
     let mut model = Model::load(&dir.join("model.safetensors")).unwrap();
     let (sizes, at_truth) = ([].into(), [].into());
     let (curvature, floor, unexplained) = (1.0, [1.0; 6], 1e9);
-    let calibration = Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth: 1.0, rival: -9.0, views: 9 };
-    model.metadata.calibration = Some(calibration);
+    let calibration =
+        Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth: 1.0, rival: -9.0, views: 9, seen: None };
     let args = format!("estimate DATA/{CHICKEN} --model model.safetensors --steps 3 --effort fast --executor cpu");
-    for (distances, doubt) in [([0.01, 99.0], None), ([98.0, 99.0], Some("distance"))] {
+    for (distances, extent, doubt) in
+        [([0.01, 99.0], 0.0, None), ([98.0, 99.0], 0.0, Some("distance")), ([0.01, 99.0], 999.0, Some("small"))]
+    {
         model.metadata.distances = Some(distances);
+        model.metadata.calibration = Some(Calibration { seen: Some(Seen { distance: 1.3, extent }), ..calibration.clone() });
         model.save(&dir.join("model.safetensors")).unwrap();
         let report: Value = serde_json::from_str(&run(dir, &format!("{args} --json"), doubt.map_or(0, |_| 1))).unwrap();
         let image = &report["images"][0];
         assert_eq!((image["trusted"].as_bool(), image["doubt"].as_str()), (Some(doubt.is_none()), doubt));
     }
-    assert!(run(dir, &args, 1).contains("DO NOT TRUST: nearer or farther"));
+    assert!(run(dir, &args, 1).contains("DO NOT TRUST: too small in the picture"));
     // Who says what to accept decides alone.
     run(dir, &format!("{args} --accept 1e9"), 0);
 }
@@ -568,7 +571,8 @@ fn an_unknown_object_has_no_known_deviations() {
     let mut model = Model::load(&dir.join("model.safetensors")).unwrap();
     let (curvature, floor, unexplained) = (1.0, [1.0; 6], 1e9);
     let (sizes, at_truth) = ([].into(), [].into());
-    let calibration = Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth: 1.0, rival: 0.0, views: 9 };
+    let calibration =
+        Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth: 1.0, rival: 0.0, views: 9, seen: None };
     model.metadata.calibration = Some(calibration);
     model.save(&dir.join("model.safetensors")).unwrap();
     let args = format!("estimate DATA/{CHICKEN} --model model.safetensors --executor cpu --unseen --json");

@@ -195,8 +195,19 @@ fn training_learns_and_writes_what_a_person_wants_to_see() {
     let model = Model::load(&run.join("model.safetensors")).unwrap();
     assert!(model.layout.density.is_none() && model.layout.features() == 16);
     assert_eq!((model.metadata.side, model.metadata.instance_names.len()), (Some(16), 9));
+    assert_eq!(model.metadata.ray_sphere, model.metadata.orbit_radius);
     let [nearest, farthest] = model.metadata.distances.unwrap();
     assert!([nearest, model.metadata.orbit_radius.unwrap(), farthest].iter().all(|distance| (distance - 1.3).abs() < 1e-3));
+}
+
+/// As in the paper, rays begin at the camera.
+#[test]
+fn the_papers_preset_has_no_sphere() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    let flags = "--preset paper --hidden 8 --latent 4 --side 8 --batch 2 --steps 1 --executor cpu";
+    succeed(&format!("fit --data {TRAIN} --out {} {flags}", run.display()));
+    assert_eq!(Model::load(&run.join("model.safetensors")).unwrap().metadata.ray_sphere, None);
 }
 
 #[test]

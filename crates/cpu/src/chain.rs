@@ -6,7 +6,8 @@ use std::ops::Range;
 
 use srn_plan::{BufferId, Step};
 use srn_shaders::{
-    AdvanceParams, DensitySumParams, ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams, RowsParams,
+    AdvanceParams, DensitySumParams, DepthParams, ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams,
+    RaysParams,
 };
 
 /// Rows of a block: what it reads and writes in a step should stay in a core's cache.
@@ -110,7 +111,8 @@ macro_rules! rows_of_groups {
 rows_of_groups! {
     ImageLossParams: |_| true;
     PointLayerParams: |p| p.weight_stride > 0;
-    RowsParams: |_| true;
+    RaysParams: |_| true;
+    DepthParams: |_| true;
 }
 
 impl RowWise for LinearParams {

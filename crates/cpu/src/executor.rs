@@ -3,7 +3,8 @@ use std::ops::Range;
 use rayon::prelude::*;
 use srn_plan::{BufferId, Element, Executor, ExecutorError, Plan, StageId, Step};
 use srn_shaders::{
-    AdvanceParams, DensitySumParams, ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams, RowsParams,
+    AdvanceParams, DensitySumParams, DepthParams, ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams,
+    RaysParams,
 };
 
 use crate::chain::{Chain, Link, RowWise, Share, Split};
@@ -424,7 +425,7 @@ macro_rules! references {
 
 references! {
     rows {
-        "rays/forward" => rays::forward(f f f f) -> (f_mut f_mut), |_p: RowsParams| [0, 0, 2, 1, 3, 3];
+        "rays/forward" => rays::forward(f f f f) -> (f_mut f_mut), |_p: RaysParams| [0, 0, 2, 1, 3, 3];
         "linear/forward" => linear::forward(f f u) -> (f_mut), |p: LinearParams| [p.in_features, 0, 0, p.out_features];
         "linear/backward_input" => linear::backward_input(f f u) -> (f_mut), |p: LinearParams| [p.out_features, 0, 0, p.in_features];
         "linear/backward_weight" => linear::backward_weight(f f) -> (f_mut), |p: LinearParams| [p.in_features, p.out_features],
@@ -447,8 +448,8 @@ references! {
             |p: DensitySumParams| [p.in_features, 0, p.features, 1, p.features];
         "density_sum/backward" => density_sum::backward(f f f f) -> (f_mut f_mut f_mut),
             |p: DensitySumParams| [1, p.features, p.features, 0, 1, p.features, p.in_features];
-        "depth/forward" => depth::forward(f f) -> (f_mut), |_p: RowsParams| [0, 3, 1];
-        "depth/backward" => depth::backward(f f) -> (f_mut), |_p: RowsParams| [0, 1, 3];
+        "depth/forward" => depth::forward(f f) -> (f_mut), |_p: DepthParams| [0, 3, 1];
+        "depth/backward" => depth::backward(f f) -> (f_mut), |_p: DepthParams| [0, 1, 3];
         "image_loss/backward" => image_loss::backward(f f f) -> (f_mut), |_p: ImageLossParams| [3, 4, 0, 3];
     }
     whole {

@@ -51,6 +51,12 @@ impl Pose6 {
         Pose6([a, r(0, 2).clamp(-1.0, 1.0).asin(), c, t.x, t.y, t.z])
     }
 
+    /// How far the camera is from the world's origin, object units.
+    pub fn distance(self) -> f64 {
+        let [.., x, y, z] = self.0;
+        DVec3::new(x, y, z).length()
+    }
+
     /// As the kernels take it.
     pub fn to_f32(self) -> [f32; 6] {
         self.0.map(|value| value as f32)

@@ -44,6 +44,18 @@ pub struct Calibration {
     pub rival: f64,
     /// Number of estimates that this is from.
     pub views: u32,
+    /// How large and how far away their objects were.
+    #[serde(default)]
+    pub seen: Option<Seen>,
+}
+
+/// How the estimates of a [`Calibration`] see their objects, the medians.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Seen {
+    /// Distance of the camera from the object's centre, object units.
+    pub distance: f64,
+    /// See [`Estimate::extent`].
+    pub extent: f64,
 }
 
 /// Why an estimate is not to be trusted.
@@ -54,9 +66,11 @@ pub enum Doubt {
     Loss,
     /// It leaves more of the picture unexplained than true poses do.
     Unexplained,
-    /// The camera is nearer to the object, or farther from it, than any that the model has learnt from, see [`Metadata::distances`](crate::Metadata):
+    /// The camera is nearer to the object, or farther from it, than the model knows, see [`Metadata::knows_distance`](crate::Metadata::knows_distance):
     /// from close by, a part of one surface explains any picture of one colour, and what the network shows there is a guess.
     Distance,
+    /// The object is less than half as large in the picture as in those that the model was calibrated with.
+    Small,
     /// A pose elsewhere explains the picture nearly as well.
     Rival,
 }
@@ -66,7 +80,8 @@ impl std::fmt::Display for Doubt {
         f.write_str(match self {
             Doubt::Loss => "the loss is no number",
             Doubt::Unexplained => "too much is unexplained",
-            Doubt::Distance => "nearer or farther than the model has learnt",
+            Doubt::Distance => "nearer or farther than the model knows",
+            Doubt::Small => "too small in the picture",
             Doubt::Rival => "another pose does nearly as well",
         })
     }
@@ -85,6 +100,21 @@ impl Calibration {
             Some(higher) if higher < self.rival => Some(Doubt::Rival),
             _ => None,
         }
+    }
+
+    /// Whether an object is so small in a picture that these estimates say little of it.
+    pub fn is_small(&self, extent: f64) -> bool {
+        self.seen.is_some_and(|seen| 2.0 * extent < seen.extent)
+    }
+
+    /// [`Calibration::floor`] for an estimate. In a smaller picture of the object errors grow as a pixel does; and how far away it is, which
+    /// shows in how large it is, is known to a part of the distance.
+    fn floor_of(&self, estimate: &Estimate) -> [f64; 6] {
+        let Some(seen) = self.seen else { return self.floor };
+        let pixel = (seen.extent / estimate.extent).max(1.0);
+        let farther = (estimate.pose.distance() / seen.distance).max(1.0);
+        let [a, b, c, x, y, z] = self.floor.map(|variance| pixel * pixel * variance);
+        [a, b, c, x, y, farther * farther * z]
     }
 }
 
@@ -117,7 +147,7 @@ impl Estimate {
     /// Covariance of the motion from the estimated pose of this instance to the true one; `None` where there is no [`Estimate::shape`].
     pub fn covariance(&self, instance: &str, calibration: &Calibration) -> Option<Matrix6> {
         let size = calibration.sizes.get(instance).copied().unwrap_or(1.0);
-        let mixed = mixed(&self.shape()?, calibration.curvature, &calibration.floor);
+        let mixed = mixed(&self.shape()?, calibration.curvature, &calibration.floor_of(self));
         Some(mixed.map(|row| row.map(|entry| size * entry)))
     }
 
@@ -278,7 +308,7 @@ mod tests {
         let ranked = |start, loss, pose| Ranked { start, loss, phases: 4, pose };
         let turned = Pose6::from_matrix(&(DMat4::from_rotation_z(1.0) * pose.to_matrix()));
         let ranking = vec![ranked(7, 2.0, pose), ranked(3, 2.1, pose), ranked(5, 3.0, turned)];
-        Estimate { pose, loss: 2.0, curvature: Some(curvature()), ranking }
+        Estimate { pose, loss: 2.0, curvature: Some(curvature()), extent: 0.5, ranking }
     }
 
     #[test]
@@ -303,9 +333,26 @@ mod tests {
         assert_eq!([0.8, 1.0].map(|part| old.doubt("well", part, None)), [None, Some(Doubt::Unexplained)]);
     }
 
+    /// Where a picture shows the object smaller than those of the calibration, all errors grow; where it is farther away, that along the view.
+    #[test]
+    fn what_is_far_away_is_less_sure() {
+        let far = estimate(look_at_origin(DVec3::new(0.0, 2.6, 0.0)));
+        let known = calibration(0.0, [1.0; 6]);
+        let variances = |seen| {
+            let covariance = far.covariance("", &Calibration { seen, ..known.clone() }).unwrap();
+            [0, 3, 5].map(|k| (1e6 * covariance[k][k]).round() / 1e6)
+        };
+        assert_eq!(variances(None), [1.0; 3]);
+        assert_eq!(variances(Some(Seen { distance: 1.3, extent: 0.5 })), [1.0, 1.0, 4.0]);
+        assert_eq!(variances(Some(Seen { distance: 1.3, extent: 1.5 })), [9.0, 9.0, 36.0]);
+        assert_eq!(variances(Some(Seen { distance: 5.2, extent: 0.1 })), [1.0; 3]);
+        let known = Calibration { seen: Some(Seen { distance: 1.3, extent: 0.9 }), ..known };
+        assert_eq!([0.4, 0.5].map(|extent| known.is_small(extent)), [true, false]);
+    }
+
     fn calibration(curvature: f64, floor: [f64; 6]) -> Calibration {
         let (sizes, at_truth) = (BTreeMap::new(), BTreeMap::new());
-        Calibration { curvature, floor, sizes, unexplained: 1.0, at_truth, above_truth: 0.0, rival: 0.0, views: 1 }
+        Calibration { curvature, floor, sizes, unexplained: 1.0, at_truth, above_truth: 0.0, rival: 0.0, views: 1, seen: None }
     }
 
     #[test]

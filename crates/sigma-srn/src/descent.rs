@@ -558,6 +558,7 @@ impl Parts<'_> {
             direction: saved.direction,
             d_origin: scratch.d_origin,
             d_direction: scratch.d_direction,
+            sphere: network.ray_sphere,
             rgb: saved.rgb(),
             wanted: tile_target,
         };

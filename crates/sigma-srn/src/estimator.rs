@@ -162,6 +162,8 @@ pub struct Estimate {
     /// Second derivatives of the loss there, those of least squares, over a turn about the object and a shift, in the camera's axes; with
     /// BFGS only.
     pub curvature: Option<[[f64; 6]; 6]>,
+    /// How long the object's diagonal is in the picture, as a part of the picture's width.
+    pub extent: f64,
     /// All starts, the winner first: more phases before fewer, then by loss.
     pub ranking: Vec<Ranked>,
 }
@@ -273,12 +275,13 @@ pub fn estimate(
     }
 
     let mut estimates = Vec::new();
-    for query in 0..queries.len() {
+    for (query, q) in queries.iter().enumerate() {
         let mut own: Vec<&Hypothesis> = hypotheses.iter().filter(|h| h.query == query).collect();
         own.sort_by(|a, b| b.phases.cmp(&a.phases).then(a.loss.total_cmp(&b.loss)));
         let ranked = |h: &&Hypothesis| Ranked { start: h.start, loss: h.loss, phases: h.phases, pose: h.pose };
         let &Hypothesis { pose, loss, curvature, .. } = own[0];
-        estimates.push(Estimate { pose, loss, curvature, ranking: own.iter().map(ranked).collect() });
+        let extent = q.intrinsics.fx / (pose.distance() * f64::from(q.width));
+        estimates.push(Estimate { pose, loss, curvature, extent, ranking: own.iter().map(ranked).collect() });
     }
     Ok(estimates)
 }

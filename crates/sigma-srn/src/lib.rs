@@ -22,7 +22,7 @@ mod trainer;
 mod unseen;
 
 pub use camera::{Intrinsics, Pose6};
-pub use confidence::{Calibration, Doubt};
+pub use confidence::{Calibration, Doubt, Seen};
 pub use descent::{Descent, Loss, Method, Shape};
 pub use engine::Engine;
 pub use error::Error;

@@ -142,6 +142,9 @@ pub struct Metadata {
     pub side: Option<u32>,
     /// Distance of the training cameras from the origin in object units, if known.
     pub orbit_radius: Option<f64>,
+    /// Radius of the sphere around the origin on which rays begin, wherever the camera is: outside the object a ray shows the same from
+    /// everywhere on it. `None`: they begin at the camera, as in the paper.
+    pub ray_sphere: Option<f64>,
     /// The nearest and the farthest of the training cameras, but for a hundredth on each side, in object units, if known.
     pub distances: Option<[f64; 2]>,
     /// How its estimates compare with known poses, if that was measured.
@@ -152,10 +155,16 @@ pub struct Metadata {
 const BEYOND: f64 = 1.1;
 /// The same beside the one distance that is known of all of them.
 const BEYOND_RADIUS: f64 = 1.25;
+/// How near a camera may be where rays begin on a sphere: half as far again as the corners of the object's box.
+const NEAREST: f64 = 0.75;
 
 impl Metadata {
-    /// Whether the model has learnt from cameras about as far from the object's centre as this one; true where it does not say from which.
+    /// Whether the model knows what a camera so far from the object's centre sees: where rays begin on a sphere, any outside of the object,
+    /// else those that are about as far away as the ones that it has learnt from; all where it does not say from which.
     pub fn knows_distance(&self, distance: f64) -> bool {
+        if self.ray_sphere.is_some() {
+            return distance >= NEAREST;
+        }
         let radius = self.orbit_radius.map(|radius| [radius / BEYOND_RADIUS, radius * BEYOND_RADIUS]);
         let range = self.distances.map(|[nearest, farthest]| [nearest / BEYOND, farthest * BEYOND]).or(radius);
         range.is_none_or(|[nearest, farthest]| nearest <= distance && distance <= farthest)
@@ -408,10 +417,16 @@ impl Model {
         let wrong = |key: &str, error: serde_json::Error| format(format!("metadata `{key}`: {error}"));
         let instance_names: Option<Vec<String>> =
             serde_json::from_str(json("instance_names")).map_err(|error| wrong("instance_names", error))?;
+        let ray_sphere = match number("ray_sphere") {
+            Some(Ok(radius)) if radius > 0.0 && radius.is_finite() => Some(radius),
+            None => None,
+            Some(_) => return Err(format("metadata `ray_sphere` must be a positive number".into())),
+        };
         let metadata = Metadata {
             instance_names: instance_names.unwrap_or_default(),
             side: number("side").and_then(Result::ok).map(|side| side as u32),
             orbit_radius: number("orbit_radius").and_then(Result::ok),
+            ray_sphere,
             distances: serde_json::from_str(json("distances")).map_err(|error| wrong("distances", error))?,
             calibration: serde_json::from_str(json("calibration")).map_err(|error| wrong("calibration", error))?,
         };
@@ -504,6 +519,9 @@ impl Model {
         }
         if let Some(radius) = self.metadata.orbit_radius {
             text.insert("orbit_radius".into(), radius.to_string());
+        }
+        if let Some(radius) = self.metadata.ray_sphere {
+            text.insert("ray_sphere".into(), radius.to_string());
         }
         if let Some(distances) = self.metadata.distances {
             text.insert("distances".into(), serde_json::json!(distances).to_string());

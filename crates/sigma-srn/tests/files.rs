@@ -15,6 +15,7 @@ fn fuzz_model() {
     let mut model = Model::init(&config, 1).unwrap();
     model.metadata.instance_names = vec!["a".into(), "b".into()];
     model.metadata.distances = Some([1.1, 1.5]);
+    model.metadata.ray_sphere = Some(1.3);
     model.save(&path).unwrap();
     let good = std::fs::read(&path).unwrap();
     assert_eq!(Model::load(&path).unwrap(), model);
@@ -40,4 +41,9 @@ fn a_model_knows_how_far_away_its_cameras_were() {
     assert_eq!(known(Metadata { orbit_radius, distances, ..Metadata::default() }), [false, false, true, true, false]);
     assert_eq!(known(Metadata { orbit_radius, ..Metadata::default() }), [false, false, false, true, false]);
     assert_eq!(known(Metadata::default()), [true; 5]);
+    // Rays that begin on a sphere show the same from everywhere outside of the object.
+    assert_eq!(
+        known(Metadata { orbit_radius, distances, ray_sphere: Some(1.3), ..Metadata::default() }),
+        [false, true, true, true, true]
+    );
 }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use sigma_srn::confidence::{self, Matrix6, fit, motion};
-use sigma_srn::{Calibration, Effort, Options};
+use sigma_srn::{Calibration, Effort, Options, Seen};
 
 use super::files::Picture;
 use super::notation::Notation;
@@ -72,6 +72,7 @@ struct Known {
     over_truth: f64,
     /// Infinite without a rival.
     rival: f64,
+    seen: Seen,
 }
 
 impl Known {
@@ -84,6 +85,7 @@ impl Known {
             unexplained: found.unexplained,
             over_truth: at_truth.map_or(0.0, |most| found.unexplained / most),
             rival: found.estimate.rival().map_or(f64::INFINITY, |(_, higher)| higher),
+            seen: Seen { distance: found.estimate.pose.distance(), extent: found.estimate.extent },
         }
     }
 
@@ -212,13 +214,19 @@ fn lost(args: &Calibrate, on: On, asked: &[Views], at_truth: &AtTruth) -> Result
 
 /// What the searches tell of others. `None` if none of them has second derivatives and found its pose.
 fn calibration(known: &[Known], lost: &[Known], at_truth: BTreeMap<String, f64>) -> Option<Calibration> {
-    let found = known.iter().filter(|known| !known.has_failed());
+    let found = || known.iter().filter(|known| !known.has_failed());
     let error = |Known { instance, motion, shape, .. }: &Known| {
         Some(confidence::Known { instance: instance.clone(), motion: *motion, shape: (*shape)? })
     };
-    let (curvature, floor, sizes) = fit(&found.filter_map(error).collect::<Vec<_>>())?;
+    let (curvature, floor, sizes) = fit(&found().filter_map(error).collect::<Vec<_>>())?;
     let Limits { unexplained, above_truth, rival } = limits(known, lost);
-    Some(Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth, rival, views: known.len() as u32 })
+    let median = |of: fn(&Seen) -> f64| {
+        let mut values: Vec<f64> = found().map(|known| of(&known.seen)).collect();
+        values.sort_by(f64::total_cmp);
+        values[values.len() / 2]
+    };
+    let seen = Some(Seen { distance: median(|seen| seen.distance), extent: median(|seen| seen.extent) });
+    Some(Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth, rival, views: known.len() as u32, seen })
 }
 
 /// What an estimate to be trusted keeps to, see [`Calibration`].
@@ -299,7 +307,8 @@ mod tests {
     fn known(rotation_deg: f64, unexplained: f64, rival: f64) -> Known {
         let shape = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
         let instance = "chair".to_string();
-        Known { instance, rotation_deg, motion: [0.01; 6], shape: Some(shape), unexplained, over_truth: unexplained / 0.1, rival }
+        let (motion, seen) = ([0.01; 6], Seen { distance: 1.3, extent: 0.9 });
+        Known { instance, rotation_deg, motion, shape: Some(shape), unexplained, over_truth: unexplained / 0.1, rival, seen }
     }
 
     #[test]

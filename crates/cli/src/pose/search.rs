@@ -10,8 +10,8 @@ use serde::Serialize;
 use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
 use sigma_srn::confidence::deviations;
 use sigma_srn::{
-    Calibration, Doubt, Effort, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer,
-    Rendering, Unseen, estimate, estimate_unseen,
+    Calibration, Doubt, Effort, Engine, Error, Estimate, Intrinsics, Loss, Metadata, Method, Model, Options, Progress, Query,
+    Renderer, Rendering, Unseen, estimate, estimate_unseen,
 };
 
 use super::files::Picture;
@@ -74,7 +74,7 @@ pub struct SearchArgs {
     /// A pose is trusted if the view from there leaves at most this part of the picture unexplained: the sum of absolute differences, over
     /// that to an empty picture. Default: what `calibrate` has found for the model, else 0.25. With the default, what looks alike from two
     /// sides is not trusted either if `calibrate` saw the search mistake them, or if the object is not one of the model's, nor is a camera
-    /// that is nearer or farther than those that the model has learnt from.
+    /// that is nearer or farther than the model knows, nor an object half as large in the picture as when the model was calibrated.
     #[arg(long, value_name = "X", value_parser = positive)]
     accept: Option<f64>,
     /// Distance of the starts of `around84` and `fixed24` from the object's centre, in object units. Default: by the size of the object in a
@@ -315,11 +315,13 @@ impl SearchArgs {
         estimate: &Estimate,
         picture: impl FnOnce(Option<f64>) -> Option<Doubt>,
     ) -> Option<Doubt> {
-        let distance = estimate.pose.to_matrix().w_axis.truncate().length();
-        let is_far = self.accept.is_none() && !model.metadata.knows_distance(distance);
+        let Metadata { calibration, .. } = &model.metadata;
+        let is_unknown = self.accept.is_none() && !model.metadata.knows_distance(estimate.pose.distance());
+        let is_small = self.accept.is_none() && calibration.as_ref().is_some_and(|known| known.is_small(estimate.extent));
         match picture(estimate.rival().map(|(_, higher)| higher)) {
             _ if !estimate.loss.is_finite() => Some(Doubt::Loss),
-            None | Some(Doubt::Rival) if is_far => Some(Doubt::Distance),
+            None | Some(Doubt::Rival) if is_unknown => Some(Doubt::Distance),
+            None | Some(Doubt::Rival) if is_small => Some(Doubt::Small),
             doubt => doubt,
         }
     }

@@ -108,8 +108,8 @@ pub fn run(args: &Track) -> Result<bool> {
             // It stands still, or goes on as it did.
             [last, earlier, ..] => Some(run(&from_frame_to_frame, vec![last, last * earlier.inverse() * last])?),
         };
-        // An object that goes too near or too far away is followed all the same.
-        let followed = followed.filter(|found| matches!(found.doubt, None | Some(Doubt::Distance)));
+        // An object that comes too near or goes too far away is followed all the same.
+        let followed = followed.filter(|found| matches!(found.doubt, None | Some(Doubt::Distance | Doubt::Small)));
         let searched = followed.is_none();
         let found = match followed {
             Some(found) => found,

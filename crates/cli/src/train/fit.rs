@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 use sigma_srn::{Engine, Losses, Metadata, Model, Random, Train, Trainer, stream, write_atomically};
 use srn_data::{Dataset, SrnSet, pixels, sheet};
 
-use super::{Changeable, ForGood, Settings, Shown, psnr_of_each, render, training_batch};
+use super::{Changeable, ForGood, Preset, Settings, Shown, psnr_of_each, render, training_batch};
 use crate::common::{self, EngineArgs, Result, load_model};
 
 /// Time between checkpoints.
@@ -86,10 +86,17 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         None => Model::init(&settings.model(), settings.seed)?,
     };
     let (orbit_radius, distances) = distances(&set);
+    if !is_resumed {
+        // What networks have learnt already they know from where their rays began.
+        let Metadata { ray_sphere, orbit_radius: trained, .. } = model.metadata;
+        let is_paper = args.for_good.preset == Some(Preset::Paper);
+        settings.ray_sphere = ray_sphere.or((!is_paper).then_some(trained.unwrap_or(orbit_radius)));
+    }
     model.metadata = Metadata {
         instance_names,
         side: Some(settings.side),
         orbit_radius: Some(orbit_radius),
+        ray_sphere: settings.ray_sphere,
         distances: Some(distances),
         calibration: None,
     };

@@ -30,6 +30,9 @@ pub struct Settings {
     pub tracing_steps: u32,
     /// False: plain SRN, without the density net.
     pub density: bool,
+    /// Radius of the sphere on which rays begin; without it, at the camera.
+    #[serde(default)]
+    pub ray_sphere: Option<f64>,
     /// Side of the images in pixels.
     pub side: u32,
     /// Views of an instance at most.
@@ -83,7 +86,7 @@ pub enum Preset {
 pub struct ForGood {
     /// Starting point for all numbers.
     #[arg(long, value_enum)]
-    preset: Option<Preset>,
+    pub preset: Option<Preset>,
     /// Begin with the networks of this trained model, whatever it was trained on, and with the mean of its codes: fewer steps will do. Sizes
     /// are the model's.
     #[arg(long, value_name = "MODEL", conflicts_with_all = ["hidden", "latent", "tracing_steps", "plain_srn"])]
@@ -199,6 +202,7 @@ impl Settings {
             latent,
             tracing_steps: 10,
             density: !for_good.plain_srn,
+            ray_sphere: None,
             side: 64,
             views: is_paper.then_some(50),
             batch: if is_paper { 10 } else { 20 },

@@ -4,6 +4,7 @@
 use srn_shaders::{EquationsParams, PoseParams};
 
 use super::chunk_of;
+use super::rays::beginning;
 use crate::Real;
 
 /// Upper triangle of `A`, `g`.
@@ -41,7 +42,7 @@ pub fn equations<T: Real>(
     let [seed, scale, soft] = [p.seed, p.scale, p.soft].map(f64::from);
     for (index, partial) in partial.chunks_exact_mut(EQUATIONS).take((p.groups * p.chunks) as usize).enumerate() {
         let (group, chunk) = (index / p.chunks as usize, index % p.chunks as usize);
-        let [x, y, z, _] = columns(&world_from_camera[12 * (p.first_group as usize + group)..]);
+        let [x, y, z, eye] = columns(&world_from_camera[12 * (p.first_group as usize + group)..]);
         let mut sums = [0.0; EQUATIONS];
         for row in chunk_of(chunk, p.chunk_rows, p.rows_per_group) {
             let at = 3 * (group * p.rows_per_group as usize + row);
@@ -51,9 +52,12 @@ pub fn equations<T: Real>(
             let weight = scale * wanted[pixel + 3].wide() / root;
 
             let [d_origin, d_direction] = [d_origin, d_direction].map(|values| three(&values[at..]).map(|d| d / seed));
-            let (by_origin, by_direction) = (cross(three(&origin[at..]), d_origin), cross(three(&direction[at..]), d_direction));
+            let direction = three(&direction[at..]);
+            let (by_origin, by_direction) = (cross(three(&origin[at..]), d_origin), cross(direction, d_direction));
             let turn = [0, 1, 2].map(|axis| by_origin[axis] + by_direction[axis]);
-            let jacobian = [dot(x, turn), dot(y, turn), dot(z, turn), dot(x, d_origin), dot(y, d_origin), dot(z, d_origin)];
+            let (d_s, begins) = (dot(d_origin, direction), beginning(eye, direction, p.sphere));
+            let shift = [0, 1, 2].map(|axis| d_origin[axis] + d_s * begins.d_eye[axis]);
+            let jacobian = [dot(x, turn), dot(y, turn), dot(z, turn), dot(x, shift), dot(y, shift), dot(z, shift)];
             let mut k = 0;
             for (a, &j) in jacobian.iter().enumerate() {
                 for &other in &jacobian[a..] {

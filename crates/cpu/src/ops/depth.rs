@@ -1,15 +1,15 @@
 //! `depth = R[:,2] · (x - t)`: z in the camera frame.
 
-use srn_shaders::RowsParams;
+use srn_shaders::DepthParams;
 
 use crate::Real;
 
-fn image(p: RowsParams, row: usize) -> usize {
+fn image(p: DepthParams, row: usize) -> usize {
     p.first_group as usize + row / p.rows_per_group as usize
 }
 
 /// Points to depths.
-pub fn forward<T: Real>(p: RowsParams, world_from_camera: &[T], x: &[T], depth: &mut [T]) {
+pub fn forward<T: Real>(p: DepthParams, world_from_camera: &[T], x: &[T], depth: &mut [T]) {
     for (row, (x, depth)) in x.chunks_exact(3).zip(depth).take((p.groups * p.rows_per_group) as usize).enumerate() {
         let m = &world_from_camera[12 * image(p, row)..];
         *depth = T::of((0..3).map(|axis| m[4 * axis + 2].wide() * (x[axis].wide() - m[4 * axis + 3].wide())).sum());
@@ -17,7 +17,7 @@ pub fn forward<T: Real>(p: RowsParams, world_from_camera: &[T], x: &[T], depth: 
 }
 
 /// Gradient of `scale · Σ min(depth, 0)²`.
-pub fn backward<T: Real>(p: RowsParams, world_from_camera: &[T], depth: &[T], d_x: &mut [T]) {
+pub fn backward<T: Real>(p: DepthParams, world_from_camera: &[T], depth: &[T], d_x: &mut [T]) {
     let scale = T::of_f32(p.scale);
     for (row, (d_x, &depth)) in d_x.chunks_exact_mut(3).zip(depth).take((p.groups * p.rows_per_group) as usize).enumerate() {
         let m = &world_from_camera[12 * image(p, row)..];

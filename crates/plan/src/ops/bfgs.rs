@@ -37,6 +37,8 @@ pub struct Residuals {
     pub d_origin: BufferId,
     /// `[rows,3]`.
     pub d_direction: BufferId,
+    /// Radius of the sphere on which they begin; 0: at the camera.
+    pub sphere: f32,
     /// Colours `[rows,3]`.
     pub rgb: BufferId,
     /// Colours wanted, and how much a pixel counts `[rows,4]`.
@@ -75,9 +77,19 @@ pub fn equations(
     let chunks = rows.rows_per_group.div_ceil(CHUNK_ROWS);
     let Rows { groups, rows_per_group, first_group } = rows;
     let Channel { number: channel, seed, scale, soft } = channel;
-    let params =
-        EquationsParams { groups, rows_per_group, first_group, chunk_rows: CHUNK_ROWS, chunks, channel, seed, scale, soft };
-    let Residuals { world_from_camera, origin, direction, d_origin, d_direction, rgb, wanted } = residuals;
+    let Residuals { world_from_camera, origin, direction, d_origin, d_direction, sphere, rgb, wanted } = residuals;
+    let params = EquationsParams {
+        groups,
+        rows_per_group,
+        first_group,
+        chunk_rows: CHUNK_ROWS,
+        chunks,
+        channel,
+        seed,
+        scale,
+        soft,
+        sphere,
+    };
     let args = [
         read(world_from_camera, size([first_group + groups, 12])),
         read(origin, n),

@@ -1,6 +1,6 @@
 //! Depth of a point: its z in the camera frame (spec 2, last line).
 
-use srn_shaders::{DEPTH_BACKWARD, DEPTH_FORWARD, RowsParams};
+use srn_shaders::{DEPTH_BACKWARD, DEPTH_FORWARD, DepthParams};
 
 use super::{overwrite, read, size};
 use crate::{BufferId, Builder, PlanError, Rows};
@@ -31,7 +31,7 @@ pub fn backward(
     b.step(&DEPTH_BACKWARD, params(rows, scale), &args, [n, 1, 1], 0, 0)
 }
 
-fn params(rows: Rows, scale: f32) -> RowsParams {
+fn params(rows: Rows, scale: f32) -> DepthParams {
     let Rows { groups, rows_per_group, first_group } = rows;
-    RowsParams { groups, rows_per_group, first_group, chunk_rows: 0, chunks: 0, scale }
+    DepthParams { groups, rows_per_group, first_group, scale }
 }

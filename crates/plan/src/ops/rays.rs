@@ -1,6 +1,6 @@
 //! Pixels to rays (spec 2, first lines), and every ray's derivative back to its image's pose matrix.
 
-use srn_shaders::{RAYS_BACKWARD, RAYS_FORWARD, RowsParams};
+use srn_shaders::{RAYS_BACKWARD, RAYS_FORWARD, RaysParams};
 
 use super::{overwrite, read, size, sum};
 use crate::{BufferId, Builder, PlanError, Rows};
@@ -19,6 +19,8 @@ pub struct Pixels {
     pub uv: BufferId,
     /// `[rows]`.
     pub z0: BufferId,
+    /// Radius of the sphere around the origin on which rays begin; 0: at the camera.
+    pub sphere: f32,
 }
 
 /// `origin, direction [rows,3]`.
@@ -33,7 +35,7 @@ pub fn forward(b: &mut Builder, rows: Rows, pixels: Pixels, origin: BufferId, di
         overwrite(origin, size([n, 3])),
         overwrite(direction, size([n, 3])),
     ];
-    b.step(&RAYS_FORWARD, params(rows, 0, 0), &args, [n, 1, 1], 0, 0)
+    b.step(&RAYS_FORWARD, params(rows, 0, 0, pixels.sphere), &args, [n, 1, 1], 0, 0)
 }
 
 /// Length of the partial sums of [`backward`].
@@ -64,12 +66,19 @@ pub fn backward(
         read(d_direction, size([n, 3])),
         overwrite(partial, partial_len(rows)),
     ];
-    b.step(&RAYS_BACKWARD, params(rows, CHUNK_ROWS, chunks), &args, [rows.groups * chunks, 1, 1], CHUNK_ROWS.into(), 0)?;
+    b.step(
+        &RAYS_BACKWARD,
+        params(rows, CHUNK_ROWS, chunks, pixels.sphere),
+        &args,
+        [rows.groups * chunks, 1, 1],
+        CHUNK_ROWS.into(),
+        0,
+    )?;
     let groups = sum::Groups { count: rows.groups, first: rows.first_group };
     sum::forward(b, groups, chunks, 12, partial, d_world_from_camera, accumulate)
 }
 
-fn params(rows: Rows, chunk_rows: u32, chunks: u32) -> RowsParams {
+fn params(rows: Rows, chunk_rows: u32, chunks: u32, sphere: f32) -> RaysParams {
     let Rows { groups, rows_per_group, first_group } = rows;
-    RowsParams { groups, rows_per_group, first_group, chunk_rows, chunks, scale: 0.0 }
+    RaysParams { groups, rows_per_group, first_group, chunk_rows, chunks, sphere }
 }

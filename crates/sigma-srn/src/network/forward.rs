@@ -148,6 +148,12 @@ impl Network {
     }
 
     pub(crate) fn pixels(&self, saved: &Saved) -> Pixels {
-        Pixels { world_from_camera: self.world_from_camera, intrinsics: self.intrinsics, uv: saved.uv, z0: saved.z0 }
+        Pixels {
+            world_from_camera: self.world_from_camera,
+            intrinsics: self.intrinsics,
+            uv: saved.uv,
+            z0: saved.z0,
+            sphere: self.ray_sphere,
+        }
     }
 }

@@ -87,6 +87,8 @@ pub(crate) struct Network {
     pub batch: Batch,
     trainable: Trainable,
     pub tracing_steps: u32,
+    /// Radius of the sphere on which rays begin; 0: at the camera.
+    pub ray_sphere: f32,
     pub instances: u32,
     /// One buffer per parameter of the model, in its order; `None` for those that are streamed.
     pub parameters: Vec<Option<BufferId>>,
@@ -197,6 +199,7 @@ impl Network {
             batch,
             trainable,
             tracing_steps: layout.tracing_steps,
+            ray_sphere: model.metadata.ray_sphere.unwrap_or(0.0) as f32,
             instances: layout.instances,
             index: b.input_u32("instance of slot", batch.slots as usize)?,
             slots: b.input_u32("slot of image", images)?,
