@@ -155,8 +155,9 @@ pub struct Metadata {
 const BEYOND: f64 = 1.1;
 /// The same beside the one distance that is known of all of them.
 const BEYOND_RADIUS: f64 = 1.25;
-/// How near a camera may be where rays begin on a sphere: half as far again as the corners of the object's box.
-const NEAREST: f64 = 0.75;
+/// How near a camera may be where rays begin on a sphere; the corners of the object's box are 0.5 away. From nearer than 0.58 anything is
+/// explained, also pictures of one colour.
+const NEAREST: f64 = 0.7;
 
 impl Metadata {
     /// Whether the model knows what a camera so far from the object's centre sees: where rays begin on a sphere, any outside of the object,

@@ -89,6 +89,7 @@ pub(crate) fn render(b: &mut Builder, network: &Network, saved: &Saved, tile: Ti
 
     tile_ops::gather(b, tile, 2, network.uv, saved.uv)?;
     tile_ops::gather(b, tile, 1, network.z0, saved.z0)?;
+    // x_0, at the camera or on the sphere around the object
     rays::forward(b, rows, network.pixels(saved), saved.x[0], saved.direction)?;
     for i in 0..=last {
         // v_i = f(x_i)
