@@ -29,6 +29,8 @@ const CHECKPOINT_INTERVAL: Duration = Duration::from_secs(60);
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
 /// Time after which the loss on the terminal is old.
 const STALE: Duration = Duration::from_secs(2);
+/// Radius of the ball around the object, object units.
+const BALL: f64 = 0.5;
 
 /// Flags of `sigma-train fit`.
 #[derive(Args, Debug)]
@@ -90,7 +92,9 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         // What networks have learnt already they know from where their rays began.
         let Metadata { ray_sphere, orbit_radius: trained, .. } = model.metadata;
         let is_paper = args.for_good.preset == Some(Preset::Paper);
-        settings.ray_sphere = ray_sphere.or((!is_paper).then_some(trained.unwrap_or(orbit_radius)));
+        // None where cameras are within the object.
+        let wanted = trained.or(Some(orbit_radius)).filter(|radius| !is_paper && *radius > BALL);
+        settings.ray_sphere = ray_sphere.or(wanted);
     }
     model.metadata = Metadata {
         instance_names,

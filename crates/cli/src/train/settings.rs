@@ -76,7 +76,7 @@ pub enum Preset {
     Compact,
     /// Twice as wide, for sets of many or fine objects: each step takes about three times as long.
     Base,
-    /// The paper's: 256 features, batches of 10 whole images at 5e-5, at most 50 views of an instance.
+    /// The paper's: 256 features, batches of 10 whole images at 5e-5, at most 50 views of an instance, rays that begin at the camera.
     Paper,
 }
 
