@@ -390,8 +390,17 @@ impl Bench<'_> {
     /// What the search for a pose finds cooperative matrices to change in gradients, before it decides on them.
     fn cooperative_difference(&self) -> Result<f64> {
         let (starts, rgb) = (camera::fixed24(1.3)[..8].to_vec(), target(3 * RAYS));
-        let query = Query { instance: 0, intrinsics: intrinsics(SIDE), width: SIDE, height: SIDE, rgb, weights: None, starts };
-        let phases = vec![Phase { steps: 0, stride: 4, keep: 1 }];
+        let query = Query {
+            instance: 0,
+            intrinsics: intrinsics(SIDE),
+            width: SIDE,
+            height: SIDE,
+            rgb,
+            weights: None,
+            coverage: None,
+            starts,
+        };
+        let phases = vec![Phase { steps: 0, stride: 4, keep: 1, light: false }];
         estimate(self.engine, self.model, &[query], &Options { phases, min_starts: 0, ..Options::default() }, |_| Ok(()))?;
         Ok(self.engine.cooperative_difference().unwrap_or(f64::NAN))
     }

@@ -46,7 +46,16 @@ fn it_finds_the_same_pose() {
     let rgb = renderer.render(&[instance], &[(truth, intrinsics())], 0).unwrap().rgb;
     let [whole, baked] = baked(true).map(|(model, instance)| -> Estimate {
         let (rgb, starts) = (rgb.clone(), camera::neighbor4(&truth));
-        let query = Query { instance, rgb, weights: None, width: SIZE[0], height: SIZE[1], intrinsics: intrinsics(), starts };
+        let query = Query {
+            instance,
+            rgb,
+            weights: None,
+            coverage: None,
+            width: SIZE[0],
+            height: SIZE[1],
+            intrinsics: intrinsics(),
+            starts,
+        };
         let options = Options::default().with_steps(6);
         estimate(&engine, &model, &[query], &options, |_| Ok(())).unwrap().remove(0)
     });

@@ -549,6 +549,8 @@ fn a_mask_takes_pixels_out_of_the_search() {
     assert_eq!(plain, other);
     assert_ne!(found("0156.png", ""), found("other/0156.png", ""), "without a mask all counts");
     assert_ne!(plain, found("0156.png", ""));
+    // What is cut out may be in other light; of a whole picture nobody knows what is the object.
+    assert!(plain["light"]["contrast"].is_f64() && found("0156.png", "")["light"].is_null(), "{plain}");
     assert_eq!(plain, found("0156.png", "--mask masks/0156.png"));
     // The box lies beside the middle: the starts look at where it is.
     let outline = image::open(dir.join("pictures/seat-0156-outline.png")).unwrap().into_rgb8();

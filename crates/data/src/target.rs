@@ -16,6 +16,8 @@ pub struct Target {
     pub rgb: Vec<f32>,
     /// How much each pixel counts, 0 to 1, `[side · side]`; `None` where all do.
     pub weights: Option<Vec<f32>>,
+    /// How much of each pixel is opaque, 0 to 1, `[side · side]`: of what counts, the rest is white. `None` where the picture was not cut.
+    pub coverage: Option<Vec<f32>>,
     /// `fx, fy, cx, cy` in pixels of the square; integer coordinates are pixel centres.
     pub intrinsics: [f32; 4],
     /// Whether the square was cut around the object.
@@ -35,12 +37,13 @@ impl Target {
         let corner = size.map(|s| ((s - extent) / 2) as i64);
         let Some(mask) = mask else {
             let (pixels, intrinsics) = load_square(path, intrinsics, side)?;
-            return Ok(Self { rgb: pixels.data, weights: None, intrinsics, cut: false, corner, extent });
+            return Ok(Self { rgb: pixels.data, weights: None, coverage: None, intrinsics, cut: false, corner, extent });
         };
         let (picture, counts) = (Pixels::open(path)?, counts(mask, size)?);
         let Intrinsics { focal: [fx, fy], centre: [cx, cy], .. } = intrinsics.of_picture(path, size)?.of_square(side);
         let (rgb, weights) = weighted(&picture, &counts, corner, extent, side);
-        Ok(Self { rgb, weights: Some(weights), intrinsics: [fx, fy, cx, cy].map(|x| x as f32), cut: false, corner, extent })
+        let intrinsics = [fx, fy, cx, cy].map(|x| x as f32);
+        Ok(Self { rgb, weights: Some(weights), coverage: None, intrinsics, cut: false, corner, extent })
     }
 
     /// Reads a photograph and cuts a square around what mask and transparency leave of it, with [`MARGIN`]; the intrinsics follow.
@@ -71,14 +74,19 @@ impl Target {
         // Edges of pixels are whole numbers half a pixel before the centres.
         let [cx, cy] = [0, 1].map(|k| (intrinsics.centre[k] + 0.5 - corner[k] as f64) * scale - 0.5);
         let intrinsics = [fx, fy, cx, cy].map(|x| x as f32);
-        let (rgb, weights) = match counts {
+        let opaque = Pixels { data: opacity.iter().flat_map(|&share| [share; 3]).collect(), ..picture };
+        let (rgb, opaque, weights) = match counts {
             Some(counts) => {
                 let (rgb, weights) = weighted(&picture, &counts, corner, extent, side);
-                (rgb, Some(weights))
+                (rgb, weighted(&opaque, &counts, corner, extent, side).0, Some(weights))
             }
-            None => (picture.square(corner, extent, 1.0).area_resample(side, side).data, None),
+            None => {
+                let cut = |of: &Pixels, outside| of.square(corner, extent, outside).area_resample(side, side).data;
+                (cut(&picture, 1.0), cut(&opaque, 0.0), None)
+            }
         };
-        Ok(Self { rgb, weights, intrinsics, cut: true, corner, extent })
+        let coverage = Some(opaque.into_iter().step_by(3).map(|share| share.clamp(0.0, 1.0)).collect());
+        Ok(Self { rgb, weights, coverage, intrinsics, cut: true, corner, extent })
     }
 }
 
@@ -136,6 +144,8 @@ mod tests {
         assert_eq!(row(0), [0.0; 6]);
         assert_eq!((row(2), row(1)), (&[0.5, 1.0, 1.0, 1.0, 1.0, 0.5][..], &[0.25, 0.5, 0.5, 0.5, 0.5, 0.25][..]));
         let pixel = |x: usize, y: usize| &target.rgb[3 * (6 * y + x)..][..3];
+        // In the mask all is opaque.
+        assert!(target.coverage.unwrap().iter().zip(&weights).all(|(cover, weight)| *cover == 1.0 || *weight == 0.0));
         // No red comes in from around the object.
         assert_eq!((pixel(0, 2), pixel(5, 2)), (&[-1.0, -1.0, 1.0][..], &[-1.0, 1.0, -1.0][..]));
         assert_eq!(pixel(0, 0), [1.0; 3]);
@@ -153,6 +163,8 @@ mod tests {
         let alone = Target::of_photo(&cut, None, &INTRINSICS, 6).unwrap();
         assert_eq!((alone.corner, alone.extent, alone.weights.is_none()), ([40, 3], 12, true));
         assert_eq!((&alone.rgb[..3], &alone.rgb[3 * 13..][..3]), (&[1.0; 3][..], &[-1.0, -1.0, 1.0][..]));
+        let coverage = alone.coverage.unwrap();
+        assert_eq!((&coverage[..6], &coverage[12..18]), (&[0.0; 6][..], &[0.5, 1.0, 1.0, 1.0, 1.0, 0.5][..]));
         let left = GrayImage::from_fn(60, 40, |x, _| Luma([if x < 46 { 255 } else { 0 }]));
         let left = saved(dir.path(), "left.png", left);
         let both = Target::of_photo(&cut, Some(&left), &INTRINSICS, 6).unwrap();
@@ -181,7 +193,7 @@ mod tests {
         let path = saved(dir.path(), "view.png", picture);
         let (pixels, intrinsics) = load_square(&path, &INTRINSICS, 8).unwrap();
         let plain = Target::of_view(&path, None, &INTRINSICS, 8).unwrap();
-        assert_eq!((&plain.rgb, plain.intrinsics, plain.weights), (&pixels.data, intrinsics, None));
+        assert_eq!((&plain.rgb, plain.intrinsics, plain.weights, plain.coverage), (&pixels.data, intrinsics, None, None));
         assert_eq!((plain.corner, plain.extent), ([10, 0], 40));
         assert_eq!(Target::of_photo(&path, None, &INTRINSICS, 8).unwrap().rgb, pixels.data);
         let top = saved(dir.path(), "top.png", GrayImage::from_fn(60, 40, |_, y| Luma([if y < 20 { 255 } else { 0 }])));

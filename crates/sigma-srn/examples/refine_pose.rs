@@ -18,8 +18,16 @@ fn main() -> Result<(), sigma_srn::Error> {
     let truth = camera::fixed24(model.metadata.orbit_radius.unwrap_or(1.3))[3];
     let rgb = Renderer::new(&engine, &model, 1, SIDE, SIDE)?.render(&[0], &[(truth, intrinsics)], 0)?.rgb;
 
-    let query =
-        Query { instance: 0, rgb, weights: None, width: SIDE, height: SIDE, intrinsics, starts: camera::neighbor4(&truth) };
+    let query = Query {
+        instance: 0,
+        rgb,
+        weights: None,
+        coverage: None,
+        width: SIDE,
+        height: SIDE,
+        intrinsics,
+        starts: camera::neighbor4(&truth),
+    };
     let estimates = estimate(&engine, &model, &[query], &Options::default(), |progress| {
         if progress.step % 50 == 0 {
             println!("step {} of {}: {} hypotheses", progress.step, progress.steps, progress.hypotheses.len());

@@ -1,11 +1,14 @@
 //! Pose estimation (spec 4): many starts per image in one batch, the unpromising ones dropped between phases.
 
+use std::iter::zip;
+
 use glam::DMat4;
 use serde::Serialize;
 
 use crate::camera::{Intrinsics, Pose6};
 use crate::descent::{Descent, Loss, Method, Shape};
 use crate::engine::Engine;
+use crate::light::Light;
 use crate::model::Model;
 use crate::random::{initial_depths, stream};
 use crate::{Error, Rays, pixel_grid};
@@ -26,6 +29,9 @@ pub struct Query {
     /// How much each pixel counts `[height, width]`, from 0, not at all: where something stands before the object, say. `None`: all
     /// the same. GMSD takes none.
     pub weights: Option<Vec<f32>>,
+    /// How much of each pixel the object covers `[height, width]`, 0 to 1; the rest of it is white. Where it is known, a phase may make up
+    /// for the light of the image, see [`Phase::light`].
+    pub coverage: Option<Vec<f32>>,
     /// Pixels per row.
     pub width: u32,
     /// Rows.
@@ -45,6 +51,9 @@ pub struct Phase {
     pub stride: u32,
     /// How many hypotheses of each image enter this phase: those with the lowest loss.
     pub keep: usize,
+    /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`] is known: see [`Light`]. From wrong
+    /// poses the light looks wrong, too.
+    pub light: bool,
 }
 
 /// How poses are estimated.
@@ -82,22 +91,23 @@ impl Default for Options {
 impl Options {
     /// BFGS: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the best few on
     /// all, until they stand still: the loss has minima side by side. Then once more with new second derivatives: where a valley is flat and
-    /// full of kinks, those that steps have learnt leave a pose a tenth of a degree before its end.
+    /// full of kinks, those that steps have learnt leave a pose a tenth of a degree before its end. These two make up for the light.
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents) = match effort {
             Effort::Fast => (84, [(6, 6), (6, 2), (5, 1), (3, 1)]),
             Effort::Normal => (84, [(8, 16), (8, 6), (16, 3), (6, 3)]),
             Effort::Exhaustive => (168, [(10, 64), (10, 20), (18, 6), (6, 6)]),
         };
-        let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX }];
-        phases.extend([4, 2, 1, 1].into_iter().zip(descents).map(|(stride, (steps, keep))| Phase { steps, stride, keep }));
+        let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX, light: false }];
+        let phase = |(stride, (steps, keep))| Phase { steps, stride, keep, light: stride == 1 };
+        phases.extend(zip([4, 2, 1, 1], descents).map(phase));
         Options { method: Method::Bfgs { soft: 0.3 }, min_starts, phases, seed: 0 }
     }
 
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
     pub fn paper() -> Self {
         let method = Method::Adam { loss: Loss::Mae, learning_rate: 0.1 };
-        Options { method, min_starts: 0, phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX }], seed: 0 }
+        Options { method, min_starts: 0, phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false }], seed: 0 }
     }
 
     /// The same with `steps` steps in all, shared between the phases in their present proportions.
@@ -162,6 +172,8 @@ pub struct Estimate {
     /// Second derivatives of the loss there, those of least squares, over a turn about the object and a shift, in the camera's axes; with
     /// BFGS only.
     pub curvature: Option<[[f64; 6]; 6]>,
+    /// The light of the image, if the last phase has made up for it.
+    pub light: Option<Light>,
     /// How long the object's diagonal is in the picture, as a part of the picture's width.
     pub extent: f64,
     /// All starts, the winner first: more phases before fewer, then by loss.
@@ -204,6 +216,7 @@ pub fn estimate(
     let steps = options.phases.iter().map(|phase| phase.steps).sum();
     let mut step = 0;
     let mut hypotheses: Vec<Hypothesis> = Vec::new();
+    let mut lights = Vec::new();
     for (query, q) in queries.iter().enumerate() {
         let new = |(start, matrix)| {
             let pose = Pose6::from_matrix(matrix);
@@ -215,7 +228,7 @@ pub fn estimate(
     }
     engine.check_cooperative(|engine| {
         let tried = &hypotheses[..hypotheses.len().min(TRIED)];
-        let mut descent = prepare(engine, model, queries, options, &options.phases[0], tried)?;
+        let (mut descent, _) = prepare(engine, model, queries, options, &options.phases[0], tried)?;
         descent.evaluate()?;
         descent.gradients()
     })?;
@@ -233,7 +246,8 @@ pub fn estimate(
         }
         dropped.extend(hypotheses.iter().filter(|h| h.phases < number));
         let names: Vec<(usize, usize)> = running.iter().map(|h| (h.query, h.start)).collect();
-        let mut descent = prepare(engine, model, queries, options, phase, &running)?;
+        let mut descent;
+        (descent, lights) = prepare(engine, model, queries, options, phase, &running)?;
         let rows = running.len() * rays_of(&queries[0], phase.stride).count();
         for _ in 0..phase.steps {
             // New depths in every step, as in the paper; but whether BFGS keeps a step must not depend on luck.
@@ -280,8 +294,8 @@ pub fn estimate(
         own.sort_by(|a, b| b.phases.cmp(&a.phases).then(a.loss.total_cmp(&b.loss)));
         let ranked = |h: &&Hypothesis| Ranked { start: h.start, loss: h.loss, phases: h.phases, pose: h.pose };
         let &Hypothesis { pose, loss, curvature, .. } = own[0];
-        let extent = q.intrinsics.fx / (pose.distance() * f64::from(q.width));
-        estimates.push(Estimate { pose, loss, curvature, extent, ranking: own.iter().map(ranked).collect() });
+        let (light, extent) = (lights[query], q.intrinsics.fx / (pose.distance() * f64::from(q.width)));
+        estimates.push(Estimate { pose, loss, curvature, light, extent, ranking: own.iter().map(ranked).collect() });
     }
     Ok(estimates)
 }
@@ -306,6 +320,7 @@ fn weights_of(query: &Query, stride: u32) -> Vec<f32> {
     weights.into_iter().map(|weight| weight / mean).collect()
 }
 
+/// The descent of a phase, and the light of each query that it makes up for. The hypotheses of a query come one after the other, the best first.
 fn prepare(
     engine: &Engine,
     model: &Model,
@@ -313,7 +328,7 @@ fn prepare(
     options: &Options,
     phase: &Phase,
     running: &[Hypothesis],
-) -> Result<Descent, Error> {
+) -> Result<(Descent, Vec<Option<Light>>), Error> {
     let mut instances: Vec<u32> = running.iter().map(|h| queries[h.query].instance).collect();
     instances.sort_unstable();
     instances.dedup();
@@ -341,7 +356,24 @@ fn prepare(
     descent.set_targets(&instances, &slots, &rays, &target, weighted.then_some(&weights))?;
     let poses: Vec<Pose6> = running.iter().map(|h| h.pose).collect();
     descent.set_poses(&poses)?;
-    Ok(descent)
+
+    let mut lights = vec![None; queries.len()];
+    if phase.light && queries.iter().any(|query| query.coverage.is_some()) {
+        descent.compare()?;
+        let (renders, values) = (descent.rgb()?, target.len() / running.len());
+        for ((hypothesis, render), target) in zip(running, renders.chunks(values)).zip(target.chunks_mut(values)) {
+            let query = &queries[hypothesis.query];
+            if let Some(coverage) = &query.coverage {
+                let coverage: Vec<f32> =
+                    rays_of(query, phase.stride).map(|(u, v)| coverage[(v * query.width + u) as usize]).collect();
+                let seen = || Light::between(target, render, &coverage, &weights_of(query, phase.stride));
+                let light = *lights[hypothesis.query].get_or_insert_with(seen);
+                light.undo(target, &coverage);
+            }
+        }
+        descent.set_targets(&instances, &slots, &rays, &target, weighted.then_some(&weights))?;
+    }
+    Ok((descent, lights))
 }
 
 fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Error> {
@@ -381,8 +413,11 @@ fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Erro
         if options.phases.iter().any(|phase| rays_of(query, phase.stride).next().is_none()) {
             return input(format!("a stride larger than {} × {} pixels", query.width, query.height));
         }
+        let pixels = query.rgb.len() / 3;
+        if query.coverage.as_ref().is_some_and(|c| c.len() != pixels || c.iter().any(|cover| !(0.0..=1.0).contains(cover))) {
+            return input(format!("needs a coverage of {pixels} values from 0 to 1"));
+        }
         if let Some(weights) = &query.weights {
-            let pixels = query.rgb.len() / 3;
             if weights.len() != pixels || weights.iter().any(|weight| !(0.0..f32::INFINITY).contains(weight)) {
                 return input(format!("needs {pixels} weights of 0 or more, finite"));
             }

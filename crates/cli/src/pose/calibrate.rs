@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use sigma_srn::confidence::{self, Matrix6, fit, motion};
-use sigma_srn::{Calibration, Effort, Options, Seen};
+use sigma_srn::{Calibration, Effort, Options, Rendering, Seen};
 
 use super::files::Picture;
 use super::notation::Notation;
@@ -158,8 +158,10 @@ impl AtTruth {
             let true_views: Vec<View> =
                 pictures.iter().zip(truths).map(|(picture, truth)| (picture.instance, *truth, picture.intrinsics)).collect();
             let renders = render(on, &true_views)?;
-            let parts =
-                pictures.iter().zip(&renders).map(|(picture, render)| (picture.name.clone(), unexplained(picture, &render.rgb)));
+            let part = |(picture, render): (&Picture, &Rendering)| {
+                (picture.name.clone(), unexplained(&picture.rgb, picture.weights.as_deref(), &render.rgb))
+            };
+            let parts = pictures.iter().zip(&renders).map(part);
             at_truth.insert(name.clone(), parts.filter(|(_, part)| part.is_finite()).collect());
             bar.inc(1);
         }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::{Doubt, Engine, Model, Pose6};
+use sigma_srn::{Doubt, Engine, Light, Model, Pose6};
 use srn_data::camera::Axes;
 
 use super::files::{ObjectArgs, Picture, PoseSource, create_dir, mask_of, model_side, srn_instance};
@@ -96,6 +96,8 @@ struct ImageReport {
     doubt: Option<Doubt>,
     /// If the model is calibrated.
     confidence: Option<Confidence>,
+    /// Of a picture that is cut out: what takes the object's colours there to the model's.
+    light: Option<Light>,
     /// The best pose elsewhere that the search followed to the end.
     rival: Option<Rival>,
     /// 2 if a second, exhaustive search has found it, for the first one's pose was not to be trusted.
@@ -272,6 +274,7 @@ fn report(
             trusted: found.is_trusted(),
             doubt: found.doubt,
             confidence: found.confidence,
+            light: found.estimate.light,
             rival: found.estimate.rival().map(rival),
             searches: found.searches,
             start: found.estimate.ranking[0].start,

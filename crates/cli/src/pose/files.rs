@@ -124,6 +124,8 @@ pub struct Picture {
     pub rgb: Vec<f32>,
     /// How much each pixel counts `[side, side]`; `None`: all the same.
     pub weights: Option<Vec<f32>>,
+    /// How much of each pixel is the object `[side, side]`, where it was cut out; the rest of it is white.
+    pub coverage: Option<Vec<f32>>,
     /// Intrinsics of the resampled picture.
     pub intrinsics: Intrinsics,
     /// Its true `world_from_camera`, if known.
@@ -165,6 +167,7 @@ impl Picture {
             instance,
             rgb: target.rgb,
             weights: target.weights,
+            coverage: target.coverage,
             intrinsics: Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 },
             truth: None,
             distance: target.cut.then(|| fx * SPAN * (1.0 + 2.0 * MARGIN) / f64::from(side)),

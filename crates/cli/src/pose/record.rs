@@ -120,6 +120,7 @@ impl Page<'_> {
         panels.extend(headings.map(|(heading, k)| self.step(heading, renders[k], k)));
         panels.push(self.difference(renders[last]));
         panels[5].captions.push(format!("{:.0} % unexplained", 100.0 * self.found.unexplained));
+        panels[5].captions.extend(self.found.estimate.light.map(|_| "the light made up for".into()));
         self.page(&panels, 2, 300, u32::MAX)
     }
 
@@ -152,7 +153,7 @@ impl Page<'_> {
     }
 
     fn difference(&self, render: &[f32]) -> Panel {
-        let [picture, render] = [&self.picture.rgb, render].map(|rgb| self.counted(rgb, [1.0; 3]));
+        let [picture, render] = [&self.found.target, render].map(|rgb| self.counted(rgb, [1.0; 3]));
         let view = draw::difference(&picture, &render, self.side, SHOWN);
         Panel { heading: "DIFFERENCE".into(), view, captions: vec!["white: none, black: much".into()] }
     }

@@ -250,8 +250,10 @@ impl SearchArgs {
             })?;
             let again = again.remove(0);
             let seconds = found.seconds + again.seconds;
-            // The first search's pose stays where the second has found no better one.
-            if again.estimate.loss < found.estimate.loss {
+            // The first search's pose stays where the second has found no better one. In the picture's own colours: with little contrast there is
+            // little loss, too.
+            let loss = |found: &Found| found.estimate.loss / found.estimate.light.map_or(1.0, |light| f64::from(light.contrast));
+            if loss(&again) < loss(found) {
                 *found = Found { searches: 2, ..again };
             }
             found.seconds = seconds;
@@ -280,13 +282,17 @@ impl SearchArgs {
     }
 
     fn found(&self, model: &Model, picture: &Picture, estimate: Estimate, render: Rendering, seconds: f64) -> Found {
-        let unexplained = unexplained(picture, &render.rgb);
+        let mut target = picture.rgb.clone();
+        if let (Some(light), Some(coverage)) = (&estimate.light, &picture.coverage) {
+            light.undo(&mut target, coverage);
+        }
+        let unexplained = unexplained(&target, picture.weights.as_deref(), &render.rgb);
         let doubt = self.doubt(model, picture.instance, &estimate, unexplained);
         let calibration = model.metadata.calibration.as_ref();
         let instance = model.instance_name(picture.instance);
         let confidence = calibration.and_then(|calibration| Confidence::of(&estimate, &instance, calibration));
         let world_from_camera = estimate.pose.to_matrix();
-        Found { world_from_camera, estimate, rgb: render.rgb, unexplained, doubt, confidence, searches: 1, seconds }
+        Found { world_from_camera, estimate, target, rgb: render.rgb, unexplained, doubt, confidence, searches: 1, seconds }
     }
 
     /// Why an estimate is not to be trusted.
@@ -370,6 +376,7 @@ fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
         instance: picture.instance,
         rgb: picture.rgb.clone(),
         weights: picture.weights.clone(),
+        coverage: picture.coverage.clone(),
         width: side,
         height: side,
         intrinsics: picture.intrinsics,
@@ -384,6 +391,8 @@ pub struct Found {
     pub estimate: Estimate,
     /// The pose.
     pub world_from_camera: DMat4,
+    /// The picture in the model's light, if it was cut out `[side, side, 3]`.
+    pub target: Vec<f32>,
     /// The model's view from there `[side, side, 3]`.
     pub rgb: Vec<f32>,
     /// The part of the picture that the render leaves unexplained: the sum of absolute differences to the render, over that to
@@ -456,12 +465,11 @@ impl std::fmt::Display for PoseError {
 }
 
 /// Sum of absolute differences to `render`, over that to a white picture; not a number if the render has one.
-pub fn unexplained(picture: &Picture, render: &[f32]) -> f64 {
-    let weight = |value: usize| picture.weights.as_ref().map_or(1.0, |weights| weights[value / 3]);
+pub fn unexplained(rgb: &[f32], weights: Option<&[f32]>, render: &[f32]) -> f64 {
+    let weight = |value: usize| weights.map_or(1.0, |weights| weights[value / 3]);
     let sum = |difference: &dyn Fn(usize) -> f32| {
-        (0..picture.rgb.len()).map(|value| f64::from(weight(value) * difference(value).abs())).sum::<f64>()
+        (0..rgb.len()).map(|value| f64::from(weight(value) * difference(value).abs())).sum::<f64>()
     };
-    let rgb = &picture.rgb;
     sum(&|value| rgb[value] - render[value].clamp(-1.0, 1.0)) / sum(&|value| rgb[value] - 1.0)
 }
 
@@ -500,7 +508,7 @@ mod tests {
 
     fn picture(intrinsics: Intrinsics) -> Picture {
         let (name, square) = (String::new(), ([0; 2], 1));
-        Picture { name, instance: 0, rgb: vec![], weights: None, intrinsics, truth: None, square, distance: None }
+        Picture { name, instance: 0, rgb: vec![], weights: None, coverage: None, intrinsics, truth: None, square, distance: None }
     }
 
     #[test]
@@ -558,18 +566,12 @@ mod tests {
 
     #[test]
     fn unexplained_is_relative_to_an_empty_picture() {
-        let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pixel_center: 0.0 };
-        let of = |rgb: &[f32], weights: Option<&[f32]>, render: &[f32]| {
-            let (rgb, weights) = (rgb.to_vec(), weights.map(<[f32]>::to_vec));
-            let picture = Picture { rgb, weights, ..picture(intrinsics) };
-            unexplained(&picture, render)
-        };
         let picture = [0.5, 1.0, -0.5];
-        assert_eq!(of(&picture, None, &picture), 0.0);
-        assert_eq!(of(&picture, None, &[1.0, 1.7, 1.0]), 1.0);
-        assert_eq!(of(&picture, None, &[0.5, 1.0, -1.5]), 0.25);
-        assert!(of(&picture, None, &[0.5, f32::NAN, -0.5]).is_nan() && of(&[1.0; 3], None, &[1.0; 3]).is_nan());
+        assert_eq!(unexplained(&picture, None, &picture), 0.0);
+        assert_eq!(unexplained(&picture, None, &[1.0, 1.7, 1.0]), 1.0);
+        assert_eq!(unexplained(&picture, None, &[0.5, 1.0, -1.5]), 0.25);
+        assert!(unexplained(&picture, None, &[0.5, f32::NAN, -0.5]).is_nan() && unexplained(&[1.0; 3], None, &[1.0; 3]).is_nan());
         let two = [0.5, 1.0, -0.5, -1.0, -1.0, -1.0];
-        assert_eq!(of(&two, Some(&[1.0, 0.0]), &[0.5, 1.0, -1.5, 1.0, 1.0, 1.0]), 0.25);
+        assert_eq!(unexplained(&two, Some(&[1.0, 0.0]), &[0.5, 1.0, -1.5, 1.0, 1.0, 1.0]), 0.25);
     }
 }

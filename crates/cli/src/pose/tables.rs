@@ -428,6 +428,7 @@ mod tests {
             instance: 0,
             rgb: vec![],
             weights: None,
+            coverage: None,
             intrinsics,
             truth: None,
             distance: None,

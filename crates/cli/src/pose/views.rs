@@ -93,7 +93,10 @@ pub fn picture(view: LoadedView, instance: u32, side: u32) -> (Picture, DMat4) {
     let (truth, intrinsics): (DMat4, Intrinsics) = camera(&view);
     let LoadedView { name, rgb, .. } = view;
     let square = ([0; 2], side as usize);
-    (Picture { name, instance, rgb, weights: None, intrinsics, truth: Some(truth), distance: None, square }, truth)
+    (
+        Picture { name, instance, rgb, weights: None, coverage: None, intrinsics, truth: Some(truth), distance: None, square },
+        truth,
+    )
 }
 
 /// `n` of the items, evenly spaced; the first among them.
