@@ -400,7 +400,7 @@ impl Bench<'_> {
             coverage: None,
             starts,
         };
-        let phases = vec![Phase { steps: 0, stride: 4, keep: 1, light: false }];
+        let phases = vec![Phase { steps: 0, stride: 4, keep: 1, light: false, dilate: false }];
         estimate(self.engine, self.model, &[query], &Options { phases, min_starts: 0, ..Options::default() }, |_| Ok(()))?;
         Ok(self.engine.cooperative_difference().unwrap_or(f64::NAN))
     }

@@ -176,7 +176,7 @@ fn light_is_made_up_for() {
             let (coverage, starts) = (is_known.then_some(coverage), vec![turn * truths[k]]);
             Query { instance, rgb, weights: None, coverage, width: SIDE, height: SIDE, intrinsics, starts }
         };
-        let phases = [10, 10].map(|steps| Phase { steps, stride: 1, keep: 1, light: true }).into();
+        let phases = [10, 10].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, dilate: false }).into();
         let options = Options { phases, min_starts: 0, ..Options::default() };
         let search = |queries: &[Query]| estimate(&engine, model, queries, &options, |_| Ok(())).unwrap();
         let [unknown, known] = [false, true].map(|is_known| search(&[0, 1, 2].map(|k| query(k, is_known))));
@@ -204,6 +204,64 @@ fn light_is_made_up_for() {
     assert!(wrong(vec![0.5; 7]).contains("coverage of 784"));
     assert!(wrong(vec![1.5; 784]).contains("from 0 to 1"));
     assert!(wrong(vec![f32::NAN; 784]).contains("from 0 to 1"));
+}
+
+/// Where the coverage is known, dilations of it are tried; another picture beside it, or hypotheses that wait, are none the worse for it.
+#[test]
+fn masks_are_tried_dilated() {
+    const SIDE: u32 = 28;
+    let intrinsics = Intrinsics { fx: 33.0, fy: 33.0, cx: 14.0, cy: 14.0, pixel_center: 0.0 };
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../assets/models/compact.safetensors");
+    let model = &Model::load(path.as_ref()).unwrap();
+    let instance = model.instance("forklift").unwrap();
+    for engine in engines() {
+        let truth = camera::fixed24(1.3)[2];
+        let shown = Renderer::new(&engine, model, 1, SIDE, SIDE).unwrap().render(&[instance], &[(truth, intrinsics)], 0).unwrap();
+        let is_object = |pixel: usize| shown.rgb[3 * pixel..][..3].iter().any(|colour| *colour < 0.9);
+        let side = SIDE as usize;
+        // A rim of one pixel is taken for the object.
+        let around =
+            |pixel: usize| [0, 1, side, 2 * side + 1].map(|d| pixel.wrapping_sub(d)).into_iter().chain([pixel + 1, pixel + side]);
+        let is_in_mask = |pixel: usize| around(pixel).any(|beside| beside < side * side && is_object(beside));
+        let coverage: Vec<f32> = (0..side * side).map(|pixel| f32::from(u8::from(is_in_mask(pixel)))).collect();
+        let colour = |value: usize| match (is_object(value / 3), is_in_mask(value / 3)) {
+            (true, _) => shown.rgb[value].clamp(-1.0, 1.0),
+            (_, true) => [0.0, -0.2, -0.5][value % 3],
+            _ => 1.0,
+        };
+        let rgb: Vec<f32> = (0..3 * side * side).map(colour).collect();
+        let query = |coverage: Option<&Vec<f32>>| {
+            let (rgb, coverage, starts) = (rgb.clone(), coverage.cloned(), vec![camera::fixed24(1.3)[10], truth]);
+            Query { instance, rgb, weights: None, coverage, width: SIDE, height: SIDE, intrinsics, starts }
+        };
+        let phase = |steps, keep, dilate| Phase { steps, stride: 1, keep, light: false, dilate };
+        let phases = vec![phase(0, 2, false), phase(2, 1, true), phase(1, 2, false)];
+        let options = Options { phases, min_starts: 0, ..Options::default() };
+        let mut steps = Vec::new();
+        let mut search = |queries: &[Query]| {
+            estimate(&engine, model, queries, &options, |progress| {
+                steps.push((progress.step, progress.steps, progress.hypotheses.len()));
+                Ok(())
+            })
+        };
+        let unknown = search(&[query(None), query(None), query(None)]).unwrap();
+        // Nothing says where the object ends in a picture of nothing else.
+        let [full, known, beside] =
+            search(&[query(Some(&vec![1.0; side * side])), query(Some(&coverage)), query(None)]).unwrap().try_into().unwrap();
+        assert_eq!([&unknown[0], &full, &known, &beside].map(|found| found.dilation.is_some()), [false, false, true, false]);
+        assert_eq!([&full, &beside].map(|found| (found.pose, found.loss)), [0, 2].map(|k| (unknown[k].pose, unknown[k].loss)));
+        assert!(known.dilation.unwrap() < -0.5 && known.dilation.unwrap() > -1.5, "{engine}: {:?}", known.dilation);
+        assert!((known.loss / unknown[0].loss) < 0.5, "{engine}: {} {}", known.loss, unknown[0].loss);
+        assert_ne!(known.target, rgb);
+        assert_eq!(beside.target, rgb);
+        assert_eq!(
+            [&known, &beside].map(|found| found.ranking.iter().map(|ranked| ranked.phases).collect::<Vec<_>>()),
+            [[3, 3]; 2]
+        );
+        let without = [(0, 1, 6), (0, 1, 6), (1, 1, 6)];
+        let with = [(0, 3, 6), (0, 3, 5), (1, 3, 5), (2, 3, 5), (2, 3, 6), (3, 3, 6)];
+        assert_eq!(steps, [without.as_slice(), &with].concat());
+    }
 }
 
 /// What an object shows that the model is not told it knows: the search begins with that very object, and ends at its pose, though the
@@ -264,7 +322,7 @@ fn second_derivatives_are_those_of_the_place() {
     let query =
         Query { instance: 1, rgb, weights: None, coverage: None, width: SIDE, height: SIDE, intrinsics: intrinsics(), starts };
     for engine in engines() {
-        let phases = vec![Phase { steps: 15, stride: 1, keep: 1, light: false }];
+        let phases = vec![Phase { steps: 15, stride: 1, keep: 1, light: false, dilate: false }];
         let options = Options { phases, min_starts: 0, seed: 0, ..Options::default() };
         let mut learnt = Vec::new();
         let observe = |progress: sigma_srn::Progress| {
@@ -318,7 +376,7 @@ fn what_does_not_count_has_no_influence() {
     let adam = |loss| Method::Adam { loss, learning_rate: 0.01 };
     let methods = [Loss::Mae, Loss::NormL2].map(adam).into_iter().chain([Method::Bfgs { soft: 0.3 }]);
     for method in methods {
-        let phases = [(2, 4), (1, 2)].map(|(stride, keep)| Phase { steps: 3, stride, keep, light: false }).into();
+        let phases = [(2, 4), (1, 2)].map(|(stride, keep)| Phase { steps: 3, stride, keep, light: false, dilate: false }).into();
         let options = Options { method, min_starts: 0, phases, seed: 0 };
         for engine in engines() {
             let found = |rgb: &[f32], weights| {

@@ -308,7 +308,16 @@ mod tests {
         let ranked = |start, loss, pose| Ranked { start, loss, phases: 4, pose };
         let turned = Pose6::from_matrix(&(DMat4::from_rotation_z(1.0) * pose.to_matrix()));
         let ranking = vec![ranked(7, 2.0, pose), ranked(3, 2.1, pose), ranked(5, 3.0, turned)];
-        Estimate { pose, loss: 2.0, curvature: Some(curvature()), light: None, extent: 0.5, ranking }
+        Estimate {
+            pose,
+            loss: 2.0,
+            curvature: Some(curvature()),
+            light: None,
+            dilation: None,
+            target: vec![],
+            extent: 0.5,
+            ranking,
+        }
     }
 
     #[test]

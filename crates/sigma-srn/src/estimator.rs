@@ -1,5 +1,6 @@
 //! Pose estimation (spec 4): many starts per image in one batch, the unpromising ones dropped between phases.
 
+use std::borrow::Cow;
 use std::iter::zip;
 
 use glam::DMat4;
@@ -9,6 +10,7 @@ use crate::camera::{Intrinsics, Pose6};
 use crate::descent::{Descent, Loss, Method, Shape};
 use crate::engine::Engine;
 use crate::light::Light;
+use crate::mask::{DILATIONS, best_dilation, dilated, has_outline};
 use crate::model::Model;
 use crate::random::{initial_depths, stream};
 use crate::{Error, Rays, pixel_grid};
@@ -54,6 +56,9 @@ pub struct Phase {
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`] is known: see [`Light`]. From wrong
     /// poses the light looks wrong, too.
     pub light: bool,
+    /// Whether masks are tried dilated and eroded by up to two pixels, where [`Query::coverage`] is known, with the best `keep` hypotheses; later phases
+    /// compare with the one that leaves the least loss, see [`Estimate::dilation`]. Other hypotheses and other images wait: none is dropped.
+    pub dilate: bool,
 }
 
 /// How poses are estimated.
@@ -91,34 +96,47 @@ impl Default for Options {
 impl Options {
     /// BFGS: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the best few on
     /// all, until they stand still: the loss has minima side by side. Then once more with new second derivatives: where a valley is flat and
-    /// full of kinks, those that steps have learnt leave a pose a tenth of a degree before its end. These two make up for the light.
+    /// full of kinks, those that steps have learnt leave a pose a tenth of a degree before its end. These two make up for the light, and before them masks
+    /// are tried dilated.
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents) = match effort {
-            Effort::Fast => (84, [(6, 6), (6, 2), (5, 1), (3, 1)]),
-            Effort::Normal => (84, [(8, 16), (8, 6), (16, 3), (6, 3)]),
-            Effort::Exhaustive => (168, [(10, 64), (10, 20), (18, 6), (6, 6)]),
+            Effort::Fast => (84, [(6, 6), (6, 2), (5, 1), (5, 1), (3, 1)]),
+            Effort::Normal => (84, [(8, 16), (8, 6), (6, 1), (16, 3), (6, 3)]),
+            Effort::Exhaustive => (168, [(10, 64), (10, 20), (6, 6), (18, 6), (6, 6)]),
         };
-        let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX, light: false }];
-        let phase = |(stride, (steps, keep))| Phase { steps, stride, keep, light: stride == 1 };
-        phases.extend(zip([4, 2, 1, 1], descents).map(phase));
+        let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, dilate: false }];
+        let phase = |((stride, light, dilate), (steps, keep))| Phase { steps, stride, keep, light, dilate };
+        let kinds = [(4, false, false), (2, false, false), (2, true, true), (1, true, false), (1, true, false)];
+        phases.extend(zip(kinds, descents).map(phase));
         Options { method: Method::Bfgs { soft: 0.3 }, min_starts, phases, seed: 0 }
     }
 
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
     pub fn paper() -> Self {
         let method = Method::Adam { loss: Loss::Mae, learning_rate: 0.1 };
-        Options { method, min_starts: 0, phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false }], seed: 0 }
+        Options {
+            method,
+            min_starts: 0,
+            phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, dilate: false }],
+            seed: 0,
+        }
     }
 
-    /// The same with `steps` steps in all, shared between the phases in their present proportions.
+    /// The same with `steps` steps in all, shared between the phases in their present proportions; those that try dilations have as many more or fewer,
+    /// and come on top.
     pub fn with_steps(mut self, steps: u32) -> Self {
-        let total = self.phases.iter().map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
+        let total = self.phases.iter().filter(|phase| !phase.dilate).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
+        let share = |of: u64| (2 * of * u64::from(steps) + total) / (2 * total);
         let (mut before, mut done) = (0, 0);
         for phase in &mut self.phases {
-            before += u64::from(phase.steps);
-            let until = (2 * before * u64::from(steps) + total) / (2 * total);
-            phase.steps = until as u32 - done;
-            done = until as u32;
+            let present = u64::from(phase.steps);
+            if phase.dilate {
+                phase.steps = share(present) as u32;
+                continue;
+            }
+            before += present;
+            phase.steps = (share(before) - done) as u32;
+            done = share(before);
         }
         self
     }
@@ -132,7 +150,7 @@ impl Options {
     /// The same with all starts, and no others, in every phase.
     pub fn without_culling(mut self) -> Self {
         self.min_starts = 0;
-        self.phases.iter_mut().for_each(|phase| phase.keep = usize::MAX);
+        self.phases.iter_mut().filter(|phase| !phase.dilate).for_each(|phase| phase.keep = usize::MAX);
         self
     }
 
@@ -155,7 +173,7 @@ pub struct Ranked {
     pub start: usize,
     /// Its loss when it was dropped, or at the end; infinite where it was not a number.
     pub loss: f64,
-    /// Phases that it went through.
+    /// Phases that it went through, or waited for.
     pub phases: usize,
     /// Its pose then.
     #[serde(skip)]
@@ -174,6 +192,10 @@ pub struct Estimate {
     pub curvature: Option<[[f64; 6]; 6]>,
     /// The light of the image, if the last phase has made up for it.
     pub light: Option<Light>,
+    /// By how many pixels the mask of the image was dilated at the end, if that was tried: below zero where it was too large.
+    pub dilation: Option<f64>,
+    /// The image as it was compared at the end, dilated and in the model's light `[height, width, 3]`.
+    pub target: Vec<f32>,
     /// How long the object's diagonal is in the picture, as a part of the picture's width.
     pub extent: f64,
     /// All starts, the winner first: more phases before fewer, then by loss.
@@ -201,6 +223,8 @@ struct Hypothesis {
     loss: f64,
     curvature: Option<[[f64; 6]; 6]>,
     phases: usize,
+    /// Of the image's mask, in the running phase.
+    dilation: f64,
 }
 
 /// Estimates the poses of all queries in one batch. `observe` is called after every evaluation: before each step, and at the end
@@ -213,14 +237,20 @@ pub fn estimate(
     mut observe: impl FnMut(Progress) -> Result<(), Error>,
 ) -> Result<Vec<Estimate>, Error> {
     check(model, queries, options)?;
-    let steps = options.phases.iter().map(|phase| phase.steps).sum();
+    let can_dilate =
+        |query: &Query| query.coverage.as_ref().is_some_and(|coverage| has_outline(coverage, query.weights.as_deref()));
+    let runs = |phase: &&Phase| !phase.dilate || queries.iter().any(can_dilate);
+    let (steps, last) = (
+        options.phases.iter().filter(runs).map(|phase| phase.steps).sum(),
+        options.phases.iter().rposition(|phase| runs(&phase)),
+    );
     let mut step = 0;
     let mut hypotheses: Vec<Hypothesis> = Vec::new();
-    let mut lights = Vec::new();
+    let (mut lights, mut dilations) = (vec![None; queries.len()], vec![None; queries.len()]);
     for (query, q) in queries.iter().enumerate() {
         let new = |(start, matrix)| {
             let pose = Pose6::from_matrix(matrix);
-            Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, phases: 0 }
+            Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, phases: 0, dilation: 0.0 }
         };
         let around = (q.starts.len() < options.min_starts).then(|| q.starts.iter().flat_map(turned));
         let starts: Vec<DMat4> = q.starts.iter().copied().chain(around.into_iter().flatten()).collect();
@@ -235,16 +265,26 @@ pub fn estimate(
 
     for (number, phase) in options.phases.iter().enumerate() {
         let mut running: Vec<Hypothesis> = Vec::new();
-        let mut dropped: Vec<Hypothesis> = Vec::new();
+        // Dropped, or waiting.
+        let mut rest: Vec<Hypothesis> = Vec::new();
         for query in 0..queries.len() {
             let mut own: Vec<Hypothesis> =
                 hypotheses.iter().copied().filter(|h| h.query == query && h.phases == number).collect();
             own.sort_by(|a, b| a.loss.total_cmp(&b.loss));
-            let rest = own.split_off(phase.keep.min(own.len()));
+            let keep = if phase.dilate && !can_dilate(&queries[query]) { 0 } else { phase.keep };
+            let mut others = own.split_off(keep.min(own.len()));
+            if phase.dilate {
+                others.iter_mut().for_each(|h| h.phases = number + 1);
+                own = own.iter().flat_map(|&h| DILATIONS.map(|dilation| Hypothesis { dilation, ..h })).collect();
+            }
             running.extend(own);
-            dropped.extend(rest);
+            rest.extend(others);
         }
-        dropped.extend(hypotheses.iter().filter(|h| h.phases < number));
+        rest.extend(hypotheses.iter().filter(|h| h.phases < number));
+        if running.is_empty() {
+            hypotheses = rest;
+            continue;
+        }
         let names: Vec<(usize, usize)> = running.iter().map(|h| (h.query, h.start)).collect();
         let mut descent;
         (descent, lights) = prepare(engine, model, queries, options, phase, &running)?;
@@ -267,7 +307,7 @@ pub fn estimate(
         }
         observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
         let standing = descent.standing()?;
-        if number + 1 == options.phases.len() && matches!(options.method, Method::Bfgs { .. }) {
+        if Some(number) == last && matches!(options.method, Method::Bfgs { .. }) {
             // What BFGS has learnt of them by now depends on how many steps it took, and on their way.
             let poses: Vec<Pose6> = standing.iter().map(|(_, pose)| *pose).collect();
             descent.set_poses(&poses)?;
@@ -284,8 +324,22 @@ pub fn estimate(
             }
             hypothesis.phases = number + 1;
         }
+        if phase.dilate {
+            // Those of one start come one after the other.
+            let least = |tried: &&[Hypothesis]| tried.iter().map(|h| h.loss).fold(f64::INFINITY, f64::min);
+            for (query, dilation) in dilations.iter_mut().enumerate() {
+                let own = running.chunks(DILATIONS.len()).filter(|tried| tried[0].query == query);
+                let best = own.min_by(|a, b| least(a).total_cmp(&least(b)));
+                let per_area = |h: &Hypothesis| h.loss / area(&queries[query], h.dilation);
+                *dilation = best.map(|tried| best_dilation(&tried.iter().map(per_area).collect::<Vec<_>>())).or(*dilation);
+            }
+            let apart = |h: &&Hypothesis| (h.dilation - dilations[h.query].unwrap_or(0.0)).abs();
+            let nearest = |tried: &[Hypothesis]| tried.iter().min_by(|a, b| apart(a).total_cmp(&apart(b))).copied();
+            running = running.chunks(DILATIONS.len()).filter_map(nearest).collect();
+        }
         hypotheses = running;
-        hypotheses.extend(dropped);
+        hypotheses.extend(rest);
+        hypotheses.iter_mut().for_each(|h| h.dilation = dilations[h.query].unwrap_or(0.0));
     }
 
     let mut estimates = Vec::new();
@@ -294,8 +348,15 @@ pub fn estimate(
         own.sort_by(|a, b| b.phases.cmp(&a.phases).then(a.loss.total_cmp(&b.loss)));
         let ranked = |h: &&Hypothesis| Ranked { start: h.start, loss: h.loss, phases: h.phases, pose: h.pose };
         let &Hypothesis { pose, loss, curvature, .. } = own[0];
-        let (light, extent) = (lights[query], q.intrinsics.fx / (pose.distance() * f64::from(q.width)));
-        estimates.push(Estimate { pose, loss, curvature, light, extent, ranking: own.iter().map(ranked).collect() });
+        let (light, dilation) = (lights[query], dilations[query]);
+        let (rgb, coverage) = seen(q, dilation.unwrap_or(0.0));
+        let mut target = rgb.into_owned();
+        if let Some(light) = light {
+            light.undo(&mut target, &coverage);
+        }
+        let extent = q.intrinsics.fx / (pose.distance() * f64::from(q.width));
+        let ranking = own.iter().map(ranked).collect();
+        estimates.push(Estimate { pose, loss, curvature, light, dilation, target, extent, ranking });
     }
     Ok(estimates)
 }
@@ -306,6 +367,24 @@ fn turned(world_from_camera: &DMat4) -> impl Iterator<Item = DMat4> {
     let turns =
         axes.into_iter().flat_map(|axis| [-TURN, TURN].map(|angle| DMat4::from_axis_angle(axis.truncate().normalize(), angle)));
     turns.map(|turn| turn * *world_from_camera)
+}
+
+/// Colours of an image, and how much the object covers (none where that is not known), with its mask dilated.
+fn seen(query: &Query, dilation: f64) -> (Cow<'_, [f32]>, Cow<'_, [f32]>) {
+    match &query.coverage {
+        Some(coverage) if dilation != 0.0 => {
+            let (rgb, coverage) = dilated(&query.rgb, coverage, query.weights.as_deref(), query.width as usize, dilation);
+            (rgb.into(), coverage.into())
+        }
+        coverage => (query.rgb.as_slice().into(), coverage.as_deref().unwrap_or_default().into()),
+    }
+}
+
+/// How many of the pixels that count the object covers with its mask dilated.
+fn area(query: &Query, dilation: f64) -> f64 {
+    let (_, coverage) = seen(query, dilation);
+    let weight = |pixel: usize| query.weights.as_ref().map_or(1.0, |weights| weights[pixel]);
+    coverage.iter().enumerate().map(|(pixel, cover)| f64::from(cover * weight(pixel))).sum()
 }
 
 fn rays_of(query: &Query, stride: u32) -> impl Iterator<Item = (u32, u32)> {
@@ -334,14 +413,15 @@ fn prepare(
     instances.dedup();
     let mut random = stream(options.seed, 0);
     let (mut slots, mut rays, mut target, mut weights) = (Vec::new(), Rays::default(), Vec::new(), Vec::new());
+    let mut coverages: Vec<Vec<f32>> = Vec::new();
     for hypothesis in running {
         let query = &queries[hypothesis.query];
         slots.push(instances.binary_search(&query.instance).expect("collected above") as u32);
         rays.push(&DMat4::IDENTITY, &query.intrinsics, rays_of(query, phase.stride), &mut random);
-        for (u, v) in rays_of(query, phase.stride) {
-            let pixel = 3 * (v * query.width + u) as usize;
-            target.extend_from_slice(&query.rgb[pixel..pixel + 3]);
-        }
+        let (rgb, coverage) = seen(query, hypothesis.dilation);
+        let pixels = || rays_of(query, phase.stride).map(|(u, v)| (v * query.width + u) as usize);
+        pixels().for_each(|pixel| target.extend_from_slice(&rgb[3 * pixel..][..3]));
+        coverages.push(if coverage.is_empty() { Vec::new() } else { pixels().map(|pixel| coverage[pixel]).collect() });
         weights.extend(weights_of(query, phase.stride));
     }
     let across = |size: u32| (phase.stride / 2..size).step_by(phase.stride as usize).count() as u32;
@@ -361,14 +441,13 @@ fn prepare(
     if phase.light && queries.iter().any(|query| query.coverage.is_some()) {
         descent.compare()?;
         let (renders, values) = (descent.rgb()?, target.len() / running.len());
-        for ((hypothesis, render), target) in zip(running, renders.chunks(values)).zip(target.chunks_mut(values)) {
+        let pictures = target.chunks_mut(values).zip(&coverages);
+        for ((hypothesis, render), (target, coverage)) in zip(running, renders.chunks(values)).zip(pictures) {
             let query = &queries[hypothesis.query];
-            if let Some(coverage) = &query.coverage {
-                let coverage: Vec<f32> =
-                    rays_of(query, phase.stride).map(|(u, v)| coverage[(v * query.width + u) as usize]).collect();
-                let seen = || Light::between(target, render, &coverage, &weights_of(query, phase.stride));
-                let light = *lights[hypothesis.query].get_or_insert_with(seen);
-                light.undo(target, &coverage);
+            if query.coverage.is_some() {
+                let between = || Light::between(target, render, coverage, &weights_of(query, phase.stride));
+                let light = *lights[hypothesis.query].get_or_insert_with(between);
+                light.undo(target, coverage);
             }
         }
         descent.set_targets(&instances, &slots, &rays, &target, weighted.then_some(&weights))?;
@@ -458,17 +537,17 @@ mod tests {
     #[test]
     fn steps_keep_their_proportions() {
         let default = Options::default();
+        // Pictures without a mask have no others.
+        let all = |options: &Options| options.phases.iter().filter(|phase| !phase.dilate).map(|phase| phase.steps).sum::<u32>();
         for steps in [0, 1, 7, 250, 1000] {
-            let options = default.clone().with_steps(steps);
-            assert_eq!(options.phases.iter().map(|phase| phase.steps).sum::<u32>(), steps);
+            assert_eq!(all(&default.clone().with_steps(steps)), steps);
         }
-        let total = default.phases.iter().map(|phase| phase.steps).sum();
+        let total = all(&default);
         assert_eq!(default.clone().with_steps(total), default);
         let keeps = |options: &Options| options.phases.iter().map(|phase| (phase.steps, phase.keep)).collect::<Vec<_>>();
         assert_eq!(keeps(&Options::paper().with_culling()), [(60, usize::MAX), (240, 6)]);
         assert_eq!(default.clone().with_culling(), default);
-        assert!(
-            default.with_stride(1).without_culling().phases.iter().all(|phase| (phase.stride, phase.keep) == (1, usize::MAX))
-        );
+        let all_to_the_end = default.with_stride(1).without_culling();
+        assert!(all_to_the_end.phases.iter().all(|phase| phase.stride == 1 && (phase.keep == usize::MAX || phase.dilate)));
     }
 }

@@ -13,6 +13,7 @@ mod engine;
 mod error;
 mod estimator;
 mod light;
+mod mask;
 mod model;
 mod network;
 mod random;

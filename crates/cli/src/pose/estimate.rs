@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::{Doubt, Engine, Light, Model, Pose6};
+use sigma_srn::{Doubt, Light, Model, Pose6};
 use srn_data::camera::Axes;
 
 use super::files::{ObjectArgs, Picture, PoseSource, create_dir, mask_of, model_side, srn_instance};
@@ -98,6 +98,8 @@ struct ImageReport {
     confidence: Option<Confidence>,
     /// Of a picture that is cut out: what takes the object's colours there to the model's.
     light: Option<Light>,
+    /// By how many pixels of the photograph its mask was dilated: below zero where it was too large.
+    mask_dilation_px: Option<f64>,
     /// The best pose elsewhere that the search followed to the end.
     rival: Option<Rival>,
     /// 2 if a second, exhaustive search has found it, for the first one's pose was not to be trusted.
@@ -147,7 +149,6 @@ pub fn run(args: &Estimate) -> Result<bool> {
         refuse_existing(files, args.force)?;
         create_dir(dir)?;
     }
-    let options = args.search.options()?;
     if let Some(path) = &args.save_model {
         if pictures.len() > 1 {
             return Err("--save-model is for one picture".into());
@@ -159,15 +160,15 @@ pub fn run(args: &Estimate) -> Result<bool> {
     if args.unseen {
         let found = unseen(args, on, &pictures, &starts)?;
         let names = vec!["unseen".to_string(); pictures.len()];
-        report(args, &engine, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
+        report(args, on, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
         return Ok(found.iter().all(Found::is_trusted));
     }
 
-    let bar = progress(options.phases.iter().map(|phase| u64::from(phase.steps)).sum(), "steps");
+    let bar = progress(0, "steps");
     let mut log = Log::default();
     let found = args.search.run_until_trusted(on, &pictures, &starts, |searches, mut progress| {
+        bar.set_length(progress.steps.into());
         if searches > 0 && progress.step == 0 {
-            bar.set_length(u64::from(progress.steps));
             bar.set_message(format!("{}, once more", pictures[progress.hypotheses[0].0].name));
         }
         bar.set_position(progress.step.into());
@@ -176,7 +177,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
     bar.finish_and_clear();
 
     let names: Vec<String> = pictures.iter().map(|picture| model.instance_name(picture.instance)).collect();
-    report(args, &engine, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
+    report(args, on, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
     if let Some(dir) = &args.record {
         for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
             log.write(dir, i, picture, found, on)?;
@@ -240,7 +241,7 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
 
 fn report(
     args: &Estimate,
-    engine: &Engine,
+    On { engine, side, .. }: On,
     names: &[String],
     pictures: &[Picture],
     found: &[Found],
@@ -275,6 +276,7 @@ fn report(
             doubt: found.doubt,
             confidence: found.confidence,
             light: found.estimate.light,
+            mask_dilation_px: found.estimate.dilation.map(|by| by * pictures[k].square.1 as f64 / f64::from(side)),
             rival: found.estimate.rival().map(rival),
             searches: found.searches,
             start: found.estimate.ranking[0].start,

@@ -153,7 +153,7 @@ impl Page<'_> {
     }
 
     fn difference(&self, render: &[f32]) -> Panel {
-        let [picture, render] = [&self.found.target, render].map(|rgb| self.counted(rgb, [1.0; 3]));
+        let [picture, render] = [&self.found.estimate.target, render].map(|rgb| self.counted(rgb, [1.0; 3]));
         let view = draw::difference(&picture, &render, self.side, SHOWN);
         Panel { heading: "DIFFERENCE".into(), view, captions: vec!["white: none, black: much".into()] }
     }

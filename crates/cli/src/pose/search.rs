@@ -282,17 +282,13 @@ impl SearchArgs {
     }
 
     fn found(&self, model: &Model, picture: &Picture, estimate: Estimate, render: Rendering, seconds: f64) -> Found {
-        let mut target = picture.rgb.clone();
-        if let (Some(light), Some(coverage)) = (&estimate.light, &picture.coverage) {
-            light.undo(&mut target, coverage);
-        }
-        let unexplained = unexplained(&target, picture.weights.as_deref(), &render.rgb);
+        let unexplained = unexplained(&estimate.target, picture.weights.as_deref(), &render.rgb);
         let doubt = self.doubt(model, picture.instance, &estimate, unexplained);
         let calibration = model.metadata.calibration.as_ref();
         let instance = model.instance_name(picture.instance);
         let confidence = calibration.and_then(|calibration| Confidence::of(&estimate, &instance, calibration));
         let world_from_camera = estimate.pose.to_matrix();
-        Found { world_from_camera, estimate, target, rgb: render.rgb, unexplained, doubt, confidence, searches: 1, seconds }
+        Found { world_from_camera, estimate, rgb: render.rgb, unexplained, doubt, confidence, searches: 1, seconds }
     }
 
     /// Why an estimate is not to be trusted.
@@ -391,8 +387,6 @@ pub struct Found {
     pub estimate: Estimate,
     /// The pose.
     pub world_from_camera: DMat4,
-    /// The picture in the model's light, if it was cut out `[side, side, 3]`.
-    pub target: Vec<f32>,
     /// The model's view from there `[side, side, 3]`.
     pub rgb: Vec<f32>,
     /// The part of the picture that the render leaves unexplained: the sum of absolute differences to the render, over that to

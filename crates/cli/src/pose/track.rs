@@ -84,7 +84,7 @@ pub fn run(args: &Track) -> Result<bool> {
     let on = On { engine: &engine, model: &model, side };
     let all_around = args.search.options()?;
     // The next pose is near; what would have to be found from afar is searched for all around instead.
-    let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true };
+    let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, dilate: false };
     let phases = vec![phase(5, 2, 2), phase(3, 1, 1)];
     let from_frame_to_frame = Options { phases, min_starts: 0, ..all_around.clone() };
 
@@ -186,7 +186,7 @@ fn side_by_side(picture: &Picture, found: &Found, side: u32) -> image::RgbImage 
     let views = [
         draw::view(&picture.rgb, side, SHOWN),
         draw::view(&found.rgb, side, SHOWN),
-        draw::difference(&found.target, &found.rgb, side, SHOWN),
+        draw::difference(&found.estimate.target, &found.rgb, side, SHOWN),
     ];
     let mut row = image::RgbImage::new(3 * views[0].width(), views[0].height());
     for (view, k) in views.iter().zip(0i64..) {

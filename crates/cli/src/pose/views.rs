@@ -70,7 +70,8 @@ pub fn search(
         let of = |(picture, truth)| args.starts(starts, on.model, picture, on.side, Some(truth), notation);
         all_starts.push(pictures.iter().zip(truths).map(of).collect::<Result<Vec<_>>>()?);
     }
-    let steps: u64 = options.phases.iter().map(|phase| u64::from(phase.steps)).sum();
+    // Views of data sets have no masks to be dilated.
+    let steps: u64 = options.phases.iter().filter(|phase| !phase.dilate).map(|phase| u64::from(phase.steps)).sum();
     let bar = progress(steps * asked.len() as u64, "steps");
     let mut found = Vec::new();
     for (i, (Views { name, pictures, .. }, starts)) in asked.iter().zip(&all_starts).enumerate() {

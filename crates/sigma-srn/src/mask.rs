@@ -1,0 +1,178 @@
+//! The mask of a picture that is cut out. Those who cut leave a rim of what is behind the object, or take a little of the object away; the
+//! object then seems larger, or smaller, than it is.
+
+use std::f64::consts::TAU;
+
+/// How far masks are tried dilated, in pixels; the first is as given.
+pub(crate) const DILATIONS: [f64; 5] = [0.0, -1.0, 1.0, -2.0, 2.0];
+
+/// By which part of its loss the mask must be worse as given than dilated: the best of exact masks are some tenths of a pixel off for the shape that a
+/// network has learnt.
+const WORSE: f64 = 0.05;
+
+/// Directions in which a pixel looks around.
+const DIRECTIONS: usize = 16;
+
+/// Whether a mask has an outline where pixels count: else nothing says where the object ends. `coverage` and `weights [pixels]`.
+pub(crate) fn has_outline(coverage: &[f32], weights: Option<&[f32]>) -> bool {
+    let counts = |pixel: usize| weights.is_none_or(|weights| weights[pixel] > 0.0);
+    let has = |is: fn(f32) -> bool| coverage.iter().enumerate().any(|(pixel, &cover)| is(cover) && counts(pixel));
+    has(|cover| cover < 0.5) && has(|cover| cover >= 0.5)
+}
+
+/// Colours and coverage of a picture on white, as if the outline of its mask were `by` pixels farther out, or in if it is negative: each pixel takes
+/// the most, or the least, coverage within this distance. Where the object grows, it has the colour of the place that it grows from. Where pixels do not
+/// count, nothing is known of the outline. `rgb [pixels, 3]`, `coverage` and `weights [pixels]`, `width` pixels per row.
+pub(crate) fn dilated(rgb: &[f32], coverage: &[f32], weights: Option<&[f32]>, width: usize, by: f64) -> (Vec<f32>, Vec<f32>) {
+    let rings = by.abs().ceil() as usize;
+    let ring =
+        |ring: usize| (0..DIRECTIONS).map(move |k| (by.abs() * ring as f64 / rings as f64, TAU * k as f64 / DIRECTIONS as f64));
+    let offsets: Vec<[f64; 2]> = (1..=rings).flat_map(ring).map(|(far, angle)| [far * angle.cos(), far * angle.sin()]).collect();
+    let (mut colours, mut covers) = (rgb.to_vec(), coverage.to_vec());
+    for (pixel, (colours, cover)) in colours.chunks_exact_mut(3).zip(&mut covers).enumerate() {
+        let place = |offset: &[f64; 2]| [(pixel % width) as f64 + offset[0], (pixel / width) as f64 + offset[1]];
+        let around = offsets.iter().filter_map(|offset| between(rgb, coverage, weights, width, place(offset)));
+        let before = *cover;
+        if by < 0.0 {
+            *cover = around.map(|(cover, _)| cover).fold(before, f32::min);
+            let left = if before > 0.0 { *cover / before } else { 1.0 };
+            colours.iter_mut().for_each(|colour| *colour = 1.0 + left * (*colour - 1.0));
+        } else if let Some((most, darker)) = around.max_by(|a, b| a.0.total_cmp(&b.0)).filter(|(most, _)| *most > before) {
+            *cover = most;
+            for (colour, darker) in colours.iter_mut().zip(darker) {
+                *colour += (most - before) / most * darker;
+            }
+        }
+    }
+    (colours, covers)
+}
+
+/// Coverage between pixels, and how much darker than white the object makes each channel there; nothing outside of the picture or beside pixels
+/// that do not count.
+fn between(rgb: &[f32], coverage: &[f32], weights: Option<&[f32]>, width: usize, [u, v]: [f64; 2]) -> Option<(f32, [f32; 3])> {
+    let height = coverage.len() / width;
+    if u < 0.0 || v < 0.0 || u > (width - 1) as f64 || v > (height - 1) as f64 {
+        return None;
+    }
+    let ([left, top], [right, below]) = ([u, v].map(f64::floor), [u, v].map(f64::fract));
+    let (mut cover, mut darker) = (0.0, [0.0; 3]);
+    for (x, y, share) in [
+        (0, 0, (1.0 - right) * (1.0 - below)),
+        (1, 0, right * (1.0 - below)),
+        (0, 1, (1.0 - right) * below),
+        (1, 1, right * below),
+    ] {
+        if share == 0.0 {
+            continue;
+        }
+        let pixel = (top as usize + y) * width + left as usize + x;
+        if weights.is_some_and(|weights| weights[pixel] == 0.0) {
+            return None;
+        }
+        cover += share as f32 * coverage[pixel];
+        for (sum, colour) in darker.iter_mut().zip(&rgb[3 * pixel..][..3]) {
+            *sum += share as f32 * (colour - 1.0);
+        }
+    }
+    Some((cover, darker))
+}
+
+/// The dilation with the least loss: where a parabola through the losses at the best that was tried and to either side of it ends; none, if the mask is not
+/// much worse as given. `losses` are in the order of [`DILATIONS`].
+pub(crate) fn best_dilation(losses: &[f64]) -> f64 {
+    let mut tried: Vec<(f64, f64)> = DILATIONS.into_iter().zip(losses.iter().copied()).collect();
+    tried.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let Some(best) = (0..tried.len()).min_by(|&a, &b| tried[a].1.total_cmp(&tried[b].1)) else { return 0.0 };
+    let ((at, least), beside) =
+        (tried[best], best.checked_sub(1).and_then(|before| Some((tried[before].1, tried.get(best + 1)?.1))));
+    let (at, least) = match beside {
+        Some((left, right)) if left + right - 2.0 * least > 0.0 && (left + right).is_finite() => {
+            let (slope, curvature) = ((right - left) / 2.0, left + right - 2.0 * least);
+            (at - slope / curvature, least - slope * slope / (2.0 * curvature))
+        }
+        _ => (at, least),
+    };
+    if least < (1.0 - WORSE) * losses[0] { at } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WIDTH: usize = 12;
+
+    /// A disc of radius 3.2 about the middle, dark blue, each pixel covered as much as it lies within.
+    fn disc(radius: f64) -> (Vec<f32>, Vec<f32>) {
+        let cover = |pixel: usize| {
+            let within = |k: usize| {
+                let [u, v] = [pixel % WIDTH, pixel / WIDTH].map(|at| at as f64 - 5.5);
+                let [x, y] = [u + (k % 16) as f64 / 16.0 - 15.0 / 32.0, v + (k / 16) as f64 / 16.0 - 15.0 / 32.0];
+                x.hypot(y) < radius
+            };
+            (0..256).filter(|&k| within(k)).count() as f32 / 256.0
+        };
+        let coverage: Vec<f32> = (0..WIDTH * WIDTH).map(cover).collect();
+        (coverage.iter().flat_map(|cover| [-0.8, -0.6, 0.4].map(|colour| cover * colour + 1.0 - cover)).collect(), coverage)
+    }
+
+    #[test]
+    fn an_outline_moves_by_as_many_pixels() {
+        let (rgb, coverage) = disc(3.2);
+        for by in [-2.0, -1.0, -0.4, 0.4, 1.0, 1.7] {
+            let (rgb, coverage) = dilated(&rgb, &coverage, None, WIDTH, by);
+            let (wanted_rgb, wanted) = disc(3.2 + by);
+            let radius = |coverage: &[f32]| (coverage.iter().sum::<f32>() / std::f32::consts::PI).sqrt();
+            let [is, should_be] = [&coverage, &wanted].map(|coverage| radius(coverage));
+            assert!((is - should_be).abs() < 0.12, "{by}: {is} instead of {should_be}");
+            // Its colour stays, also where there was none before.
+            let apart = rgb.iter().zip(&wanted_rgb).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(apart < 0.7, "{by}: {apart}");
+            for (rgb, cover) in rgb.chunks(3).zip(&coverage) {
+                let on_white = [-0.8, -0.6, 0.4].map(|colour| cover * colour + 1.0 - cover);
+                assert!(rgb.iter().zip(on_white).all(|(a, b)| (a - b).abs() < 1e-5), "{by}: {rgb:?} {on_white:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_does_not_count_has_no_outline() {
+        let (rgb, mut coverage) = disc(3.2);
+        assert!(has_outline(&coverage, None));
+        // The upper half is hidden: what it is said to cover does not matter.
+        let weights: Vec<f32> = (0..WIDTH * WIDTH).map(|pixel| if pixel < 6 * WIDTH { 0.0 } else { 1.0 }).collect();
+        let of = |coverage: &[f32], by| dilated(&rgb, coverage, Some(&weights), WIDTH, by).1.split_off(6 * WIDTH);
+        let before = [-1.0, 1.0].map(|by| of(&coverage, by));
+        coverage[..6 * WIDTH].fill(1.0);
+        assert_eq!(before, [-1.0, 1.0].map(|by| of(&coverage, by)));
+        assert!(has_outline(&coverage, Some(&weights)));
+        coverage[6 * WIDTH..].fill(1.0);
+        assert!(!has_outline(&coverage, Some(&weights)) && !has_outline(&coverage, None) && !has_outline(&[0.0; 9], None));
+        coverage[..6 * WIDTH].fill(0.0);
+        assert!(has_outline(&coverage, None) && !has_outline(&coverage, Some(&weights)));
+    }
+
+    #[test]
+    fn the_edge_of_a_picture_is_no_outline() {
+        let coverage = vec![1.0; WIDTH * WIDTH];
+        let rgb = vec![0.0; 3 * WIDTH * WIDTH];
+        for by in [-2.0, 0.7] {
+            let (colours, covers) = dilated(&rgb, &coverage, None, WIDTH, by);
+            assert!(colours.iter().all(|colour| colour.abs() < 1e-5) && covers.iter().all(|cover| *cover > 0.9999), "{by}");
+        }
+    }
+
+    #[test]
+    fn the_best_dilation_lies_between_those_tried() {
+        let losses = |least: f64, depth: f64| DILATIONS.map(|by| 1.0 + depth * (by - least) * (by - least));
+        for least in [-1.4, -0.7, 0.8, 1.3] {
+            assert!((best_dilation(&losses(least, 0.5)) - least).abs() < 1e-9, "{least}");
+        }
+        // Beyond them there is nothing to go by.
+        assert_eq!([-3.0, 2.6].map(|least| best_dilation(&losses(least, 0.5))), [-2.0, 2.0]);
+        // Nearly exact masks stay as they are, and those of searches that went wrong.
+        assert_eq!([best_dilation(&losses(0.2, 0.5)), best_dilation(&losses(1.3, 0.01))], [0.0; 2]);
+        assert_eq!(best_dilation(&[f64::INFINITY; 5]), 0.0);
+        assert_eq!(best_dilation(&[1.0, 0.5, f64::INFINITY, f64::INFINITY, 2.0]), -1.0);
+        assert_eq!(best_dilation(&[f64::NAN, 0.5, 1.0, 1.0, 2.0]), 0.0);
+    }
+}
