@@ -32,7 +32,7 @@ pub struct Query {
     /// the same. GMSD takes none.
     pub weights: Option<Vec<f32>>,
     /// How much of each pixel the object covers `[height, width]`, 0 to 1; the rest of it is white. Where it is known, a phase may make up
-    /// for the light of the image, see [`Phase::light`].
+    /// for the light of the image, see [`Phase::light`], and for an outline that is not exact, see [`Phase::dilate`].
     pub coverage: Option<Vec<f32>>,
     /// Pixels per row.
     pub width: u32,

@@ -1,5 +1,5 @@
-//! The mask of a picture that is cut out. Those who cut leave a rim of what is behind the object, or take a little of the object away; the
-//! object then seems larger, or smaller, than it is.
+//! The mask of a picture that is cut out. Who cuts leaves a rim of what is behind the object, or takes a little of the object away; it
+//! then seems larger, or smaller, than it is.
 
 use std::f64::consts::TAU;
 
