@@ -151,15 +151,20 @@ fn poses_near_the_truth_come_nearer() {
     }
 }
 
+/// The shipped model, an object of it, and a lens for pictures of 28 × 28 pixels.
+fn shipped_forklift() -> (Model, u32, Intrinsics) {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../assets/models/compact.safetensors");
+    let model = Model::load(path.as_ref()).unwrap();
+    let instance = model.instance("forklift").unwrap();
+    (model, instance, Intrinsics { fx: 33.0, fy: 33.0, cx: 14.0, cy: 14.0, pixel_center: 0.0 })
+}
+
 /// Pictures of what the shipped model knows, in other light: where the coverage is known, the search makes up for it; what is known of one
 /// picture changes nothing of another.
 #[test]
 fn light_is_made_up_for() {
     const SIDE: u32 = 28;
-    let intrinsics = Intrinsics { fx: 33.0, fy: 33.0, cx: 14.0, cy: 14.0, pixel_center: 0.0 };
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../assets/models/compact.safetensors");
-    let model = &Model::load(path.as_ref()).unwrap();
-    let instance = model.instance("forklift").unwrap();
+    let (ref model, instance, intrinsics) = shipped_forklift();
     for engine in engines() {
         let truths = [2, 9, 11].map(|k| camera::fixed24(1.3)[k]);
         let cameras = truths.map(|truth| (truth, intrinsics));
@@ -210,10 +215,7 @@ fn light_is_made_up_for() {
 #[test]
 fn masks_are_tried_dilated() {
     const SIDE: u32 = 28;
-    let intrinsics = Intrinsics { fx: 33.0, fy: 33.0, cx: 14.0, cy: 14.0, pixel_center: 0.0 };
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../assets/models/compact.safetensors");
-    let model = &Model::load(path.as_ref()).unwrap();
-    let instance = model.instance("forklift").unwrap();
+    let (ref model, instance, intrinsics) = shipped_forklift();
     for engine in engines() {
         let truth = camera::fixed24(1.3)[2];
         let shown = Renderer::new(&engine, model, 1, SIDE, SIDE).unwrap().render(&[instance], &[(truth, intrinsics)], 0).unwrap();
