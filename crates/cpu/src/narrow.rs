@@ -1,15 +1,26 @@
-//! Products of blocks of rows with the weights of a narrow layer, on processors with AVX-512: sums stay in registers and begin with the
-//! bias. Wide layers are the matrix library's, which is as fast there.
+//! Products of blocks of rows with the weights of a narrow layer: sums stay in the processor's registers and begin with the bias. Wide
+//! layers are the matrix library's, which is as fast there.
 
 use std::cell::RefCell;
 
-/// Values of a vector.
-const LANES: usize = 16;
-/// Vectors of outputs whose sums are held at once.
-const VECTORS: usize = 4;
-const COLUMNS: usize = VECTORS * LANES;
-/// Inputs at a time: their weights for [`COLUMNS`] outputs stay in the first cache.
+use pulp::{Arch, Simd, WithSimd};
+
+/// Inputs at a time: their weights for as many outputs as have their sums in registers stay in the first cache.
 const DEPTH: usize = 128;
+/// Rows whose sums are held at once.
+const ROWS: usize = 6;
+/// Inputs in a turn of the loop; vectors are as long or longer.
+const AT_A_TIME: usize = 4;
+
+/// Vectors of outputs whose sums are held at once: with the weights of an input, [`ROWS`] times as many take all but a few of the registers,
+/// 32 of sixteen values or 16 of eight. None for other processors: what is best there could not be measured.
+const fn vectors(lanes: usize) -> usize {
+    match lanes {
+        16 => 4,
+        8 => 2,
+        _ => 0,
+    }
+}
 
 /// What the sums begin with.
 #[derive(Clone, Copy)]
@@ -32,15 +43,36 @@ pub(crate) enum Weights<'a> {
 pub(crate) struct Layer<'a> {
     ins: usize,
     outs: usize,
-    /// `[ins, outs]`, or one such matrix after the other, each for the next [`COLUMNS`] outputs.
+    /// `[ins, outs]`, or one such matrix after the other, each for the next [`columns`] outputs.
     values: &'a [f32],
     in_columns: bool,
 }
 
+/// Values of a vector of this processor.
+fn lanes() -> usize {
+    struct Lanes;
+
+    impl WithSimd for Lanes {
+        type Output = usize;
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, _: S) -> usize {
+            S::F32_LANES
+        }
+    }
+
+    Arch::new().dispatch(Lanes)
+}
+
+/// Outputs whose sums are held at once.
+fn columns() -> usize {
+    lanes() * vectors(lanes())
+}
+
 /// Whether there are products with such layers here.
 pub(crate) fn is_for(ins: usize, outs: usize) -> bool {
-    let narrow = ins.min(outs) <= DEPTH && ins.is_multiple_of(LANES) && outs.is_multiple_of(LANES);
-    narrow && avx512::is_there()
+    let lanes = lanes();
+    vectors(lanes) > 0 && ins.min(outs) <= DEPTH && ins.is_multiple_of(lanes) && outs.is_multiple_of(lanes)
 }
 
 /// Works with a layer for which [`is_for`] holds.
@@ -56,9 +88,9 @@ pub(crate) fn with_layer(ins: usize, outs: usize, weights: Weights, work: impl F
             if transposed.len() < values.len() {
                 transposed.resize(values.len(), 0.0);
             }
-            for (values, columns) in values.chunks(COLUMNS * ins).zip(transposed.chunks_mut(COLUMNS * ins)) {
-                // SAFETY: the processor has AVX-512; both have `ins` values for each of a multiple of the lanes, as `ins` is.
-                unsafe { avx512::transpose(values, ins, columns) };
+            let length = columns() * ins;
+            for (from, to) in values.chunks(length).zip(transposed.chunks_mut(length)) {
+                transpose(from, ins, to);
             }
             work(&Layer { ins, outs, values: transposed, in_columns: true });
         }),
@@ -72,8 +104,9 @@ impl Layer<'_> {
         let rows = y.len() / outs;
         assert!(rows > 0 && y.len() == rows * outs && stride >= ins && x.len() >= (rows - 1) * stride + ins);
         assert!(!matches!(begin, Begin::Bias(bias) if bias.len() < outs));
-        for out in (0..outs).step_by(COLUMNS) {
-            let columns = COLUMNS.min(outs - out);
+        let most = columns();
+        for out in (0..outs).step_by(most) {
+            let columns = most.min(outs - out);
             let (w, w_stride) = if in_columns { (&values[out * ins..], columns) } else { (&values[out..], outs) };
             for first in (0..ins).step_by(DEPTH) {
                 let depth = DEPTH.min(ins - first);
@@ -83,26 +116,18 @@ impl Layer<'_> {
                     _ => Begin::Before,
                 };
                 let (x, w, y) = (&x[first..], &w[first * w_stride..], &mut y[out..]);
-                let block = Block { rows, depth, x, x_stride: stride, w, w_stride, begin, y, y_stride: outs };
-                // SAFETY: the processor has AVX-512. By the assertions here and in `with_layer`, there are `rows` rows of `x` and `y`, and
-                // `depth` of `w`, that far apart, the last with all the values that the others have.
-                unsafe {
-                    match columns / LANES {
-                        1 => block.run::<1>(),
-                        2 => block.run::<2>(),
-                        3 => block.run::<3>(),
-                        _ => block.run::<VECTORS>(),
-                    }
-                }
+                // By the assertions here and in `with_layer` there are `rows` rows of `x` and `y`, and `depth` of `w`, that far apart, the
+                // last with all the values that the others have; a bias has `columns` values.
+                Arch::new().dispatch(Block { rows, columns, depth, x, x_stride: stride, w, w_stride, begin, y, y_stride: outs });
             }
         }
     }
 }
 
 /// Rows of inputs, for some of the inputs and of the outputs.
-#[cfg_attr(not(target_arch = "x86_64"), expect(dead_code, reason = "there is nothing there that reads it"))]
 struct Block<'a> {
     rows: usize,
+    columns: usize,
     depth: usize,
     x: &'a [f32],
     x_stride: usize,
@@ -113,148 +138,119 @@ struct Block<'a> {
     y_stride: usize,
 }
 
-#[cfg(target_arch = "x86_64")]
-mod avx512 {
-    use std::arch::x86_64::*;
+impl WithSimd for Block<'_> {
+    type Output = ();
 
-    use super::{Begin, Block, LANES};
-
-    /// Rows whose sums are held at once: with the weights of an input, they take all but a few of the 32 registers.
-    const ROWS: usize = 6;
-
-    pub fn is_there() -> bool {
-        is_x86_feature_detected!("avx512f")
-    }
-
-    impl Block<'_> {
-        /// # Safety
-        /// The processor has AVX-512, `x` has `rows` rows of `depth` values, `w` has `depth` of `V` vectors, a bias has `V` vectors, and
-        /// `y` has `rows` rows of `V`.
-        #[target_feature(enable = "avx512f")]
-        pub unsafe fn run<const V: usize>(mut self) {
-            let mut row = 0;
-            // SAFETY: no row beyond the last.
-            unsafe {
-                while row + ROWS <= self.rows {
-                    self.sums::<ROWS, V>(row);
-                    row += ROWS;
-                }
-                match self.rows - row {
-                    0 => {}
-                    1 => self.sums::<1, V>(row),
-                    2 => self.sums::<2, V>(row),
-                    3 => self.sums::<3, V>(row),
-                    4 => self.sums::<4, V>(row),
-                    _ => self.sums::<5, V>(row),
-                }
-            }
-        }
-
-        /// # Safety
-        /// As for [`Block::run`], of `R` rows from `row` on.
-        #[target_feature(enable = "avx512f")]
-        #[inline]
-        unsafe fn sums<const R: usize, const V: usize>(&mut self, row: usize) {
-            let &mut Block { depth, x_stride, w_stride, begin, y_stride, .. } = self;
-            // SAFETY: the caller's.
-            unsafe {
-                let (x, w) = (self.x.as_ptr().add(row * x_stride), self.w.as_ptr());
-                let y = self.y.as_mut_ptr().add(row * y_stride);
-                let mut sums = [[_mm512_setzero_ps(); V]; R];
-                for (r, sums) in sums.iter_mut().enumerate() {
-                    for (v, sum) in sums.iter_mut().enumerate() {
-                        match begin {
-                            Begin::Zero => {}
-                            Begin::Bias(bias) => *sum = _mm512_loadu_ps(bias.as_ptr().add(LANES * v)),
-                            Begin::Before => *sum = _mm512_loadu_ps(y.add(r * y_stride + LANES * v)),
-                        }
-                    }
-                }
-                for k in 0..depth {
-                    let w: [__m512; V] = std::array::from_fn(|v| _mm512_loadu_ps(w.add(k * w_stride + LANES * v)));
-                    for (r, sums) in sums.iter_mut().enumerate() {
-                        let x = _mm512_set1_ps(*x.add(r * x_stride + k));
-                        for (sum, &w) in sums.iter_mut().zip(&w) {
-                            *sum = _mm512_fmadd_ps(x, w, *sum);
-                        }
-                    }
-                }
-                for (r, sums) in sums.iter().enumerate() {
-                    for (v, &sum) in sums.iter().enumerate() {
-                        _mm512_storeu_ps(y.add(r * y_stride + LANES * v), sum);
-                    }
-                }
-            }
-        }
-    }
-
-    /// `to [ins, outs] = from [outs, ins]ᵀ`.
-    ///
-    /// # Safety
-    /// The processor has AVX-512; `ins` and `outs`, the length of `from` over `ins`, are multiples of the lanes, and `to` is as long.
-    #[target_feature(enable = "avx512f")]
-    pub unsafe fn transpose(from: &[f32], ins: usize, to: &mut [f32]) {
-        let outs = from.len() / ins;
-        for out in (0..outs).step_by(LANES) {
-            for first in (0..ins).step_by(LANES) {
-                // SAFETY: a whole square lies there, in both.
-                unsafe { square(from.as_ptr().add(out * ins + first), ins, to.as_mut_ptr().add(first * outs + out), outs) }
-            }
-        }
-    }
-
-    /// A square of as many rows as lanes: pairs of rows, then fours, change places within quarters of the vectors, then the quarters do.
-    ///
-    /// # Safety
-    /// The processor has AVX-512, and both sides have these rows, so far apart.
-    #[target_feature(enable = "avx512f")]
-    #[inline]
-    unsafe fn square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
-        // SAFETY: the caller's.
-        let mut a: [__m512; LANES] = std::array::from_fn(|row| unsafe { _mm512_loadu_ps(from.add(row * from_stride)) });
-        let mut b = a;
-        for i in 0..8 {
-            b[2 * i] = _mm512_unpacklo_ps(a[2 * i], a[2 * i + 1]);
-            b[2 * i + 1] = _mm512_unpackhi_ps(a[2 * i], a[2 * i + 1]);
-        }
-        for i in [0, 4, 8, 12] {
-            let [p, q, r, s] = [b[i], b[i + 1], b[i + 2], b[i + 3]].map(|four| _mm512_castps_pd(four));
-            a[i] = _mm512_castpd_ps(_mm512_unpacklo_pd(p, r));
-            a[i + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(p, r));
-            a[i + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(q, s));
-            a[i + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(q, s));
-        }
-        for i in 0..4 {
-            for j in [i, i + 8] {
-                b[j] = _mm512_shuffle_f32x4(a[j], a[j + 4], 0b10_00_10_00);
-                b[j + 4] = _mm512_shuffle_f32x4(a[j], a[j + 4], 0b11_01_11_01);
-            }
-        }
-        for i in 0..8 {
-            a[i] = _mm512_shuffle_f32x4(b[i], b[i + 8], 0b10_00_10_00);
-            a[i + 8] = _mm512_shuffle_f32x4(b[i], b[i + 8], 0b11_01_11_01);
-        }
-        for (row, &values) in a.iter().enumerate() {
-            // SAFETY: the caller's.
-            unsafe { _mm512_storeu_ps(to.add(row * to_stride), values) };
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        match (vectors(S::F32_LANES), self.columns / S::F32_LANES) {
+            (2.., 1) => self.run::<S, 1>(simd),
+            (2.., 2) => self.run::<S, 2>(simd),
+            (4.., 3) => self.run::<S, 3>(simd),
+            (4.., 4) => self.run::<S, 4>(simd),
+            _ => unreachable!("`is_for` is false, or more columns than are held"),
         }
     }
 }
 
-/// Other processors never get here.
-#[cfg(not(target_arch = "x86_64"))]
-mod avx512 {
-    pub fn is_there() -> bool {
-        false
-    }
-
-    impl super::Block<'_> {
-        pub unsafe fn run<const V: usize>(self) {
-            unreachable!("`is_there` is false")
+impl Block<'_> {
+    /// All rows, of `V` vectors of outputs.
+    #[inline(always)]
+    fn run<S: Simd, const V: usize>(mut self, simd: S) {
+        let whole = self.rows - self.rows % ROWS;
+        for row in (0..whole).step_by(ROWS) {
+            self.sums::<S, ROWS, V>(simd, row);
+        }
+        match self.rows - whole {
+            0 => {}
+            1 => self.sums::<S, 1, V>(simd, whole),
+            2 => self.sums::<S, 2, V>(simd, whole),
+            3 => self.sums::<S, 3, V>(simd, whole),
+            4 => self.sums::<S, 4, V>(simd, whole),
+            _ => self.sums::<S, 5, V>(simd, whole),
         }
     }
 
-    pub unsafe fn transpose(_from: &[f32], _ins: usize, _to: &mut [f32]) {
-        unreachable!("`is_there` is false")
+    /// `R` rows from `row` on.
+    #[inline(always)]
+    fn sums<S: Simd, const R: usize, const V: usize>(&mut self, simd: S, row: usize) {
+        let &mut Block { depth, x_stride, w_stride, begin, y_stride, .. } = self;
+        assert!(row + R <= self.rows);
+        // SAFETY: see `Layer::product`, and `is_for` for the last turn of the loop.
+        unsafe {
+            let (x, w) = (self.x.as_ptr().add(row * x_stride), self.w.as_ptr());
+            let y = self.y.as_mut_ptr().add(row * y_stride);
+            let vector = |from: *const f32, v: usize| from.cast::<S::f32s>().add(v);
+            let mut sums = [[simd.splat_f32s(0.0); V]; R];
+            for r in 0..R {
+                for v in 0..V {
+                    match begin {
+                        Begin::Zero => {}
+                        Begin::Bias(bias) => sums[r][v] = vector(bias.as_ptr(), v).read_unaligned(),
+                        Begin::Before => sums[r][v] = vector(y.add(r * y_stride), v).read_unaligned(),
+                    }
+                }
+            }
+            for first in (0..depth).step_by(AT_A_TIME) {
+                for k in first..first + AT_A_TIME {
+                    let mut weights = [simd.splat_f32s(0.0); V];
+                    for v in 0..V {
+                        weights[v] = vector(w.add(k * w_stride), v).read_unaligned();
+                    }
+                    for r in 0..R {
+                        let x = simd.splat_f32s(*x.add(r * x_stride + k));
+                        for v in 0..V {
+                            sums[r][v] = simd.mul_add_e_f32s(x, weights[v], sums[r][v]);
+                        }
+                    }
+                }
+            }
+            for r in 0..R {
+                for v in 0..V {
+                    y.add(r * y_stride).cast::<S::f32s>().add(v).write_unaligned(sums[r][v]);
+                }
+            }
+        }
+    }
+}
+
+/// `to [ins, outs] = from [outs, ins]ᵀ`, both sizes multiples of four.
+fn transpose(from: &[f32], ins: usize, to: &mut [f32]) {
+    let outs = from.len() / ins;
+    assert!(ins.is_multiple_of(4) && outs.is_multiple_of(4) && from.len() == outs * ins && to.len() >= from.len());
+    for out in (0..outs).step_by(4) {
+        for first in (0..ins).step_by(4) {
+            // SAFETY: four times four values lie there, in both.
+            unsafe { square(from.as_ptr().add(out * ins + first), ins, to.as_mut_ptr().add(first * outs + out), outs) }
+        }
+    }
+}
+
+/// Four times four values change places. Every processor of this kind has SSE.
+///
+/// # Safety
+/// Both sides have four rows of four values, so far apart.
+#[cfg(target_arch = "x86_64")]
+unsafe fn square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
+    use std::arch::x86_64::*;
+    // SAFETY: the caller's.
+    unsafe {
+        let [mut a, mut b, mut c, mut d] = std::array::from_fn(|row| _mm_loadu_ps(from.add(row * from_stride)));
+        _MM_TRANSPOSE4_PS(&mut a, &mut b, &mut c, &mut d);
+        for (row, values) in [a, b, c, d].into_iter().enumerate() {
+            _mm_storeu_ps(to.add(row * to_stride), values);
+        }
+    }
+}
+
+/// The same for others.
+///
+/// # Safety
+/// Both sides have four rows of four values, so far apart.
+#[cfg(not(target_arch = "x86_64"))]
+unsafe fn square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
+    for (row, column) in (0..16).map(|k| (k / 4, k % 4)) {
+        // SAFETY: the caller's.
+        unsafe { *to.add(column * to_stride + row) = *from.add(row * from_stride + column) }
     }
 }
