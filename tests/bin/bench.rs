@@ -398,6 +398,7 @@ impl Bench<'_> {
             rgb,
             weights: None,
             coverage: None,
+            dilation: 0.0,
             starts,
         };
         let phases = vec![Phase { steps: 0, stride: 4, keep: 1, light: false, dilate: false }];

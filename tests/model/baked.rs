@@ -51,6 +51,7 @@ fn it_finds_the_same_pose() {
             rgb,
             weights: None,
             coverage: None,
+            dilation: 0.0,
             width: SIZE[0],
             height: SIZE[1],
             intrinsics: intrinsics(),

@@ -179,7 +179,7 @@ fn light_is_made_up_for() {
             };
             let rgb = view.iter().enumerate().map(light).collect();
             let (coverage, starts) = (is_known.then_some(coverage), vec![turn * truths[k]]);
-            Query { instance, rgb, weights: None, coverage, width: SIDE, height: SIDE, intrinsics, starts }
+            Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
         };
         let phases = [10, 10].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, dilate: false }).into();
         let options = Options { phases, min_starts: 0, ..Options::default() };
@@ -203,7 +203,8 @@ fn light_is_made_up_for() {
     let wrong = |coverage: Vec<f32>| {
         let (rgb, starts) = (vec![0.0; 3 * (SIDE * SIDE) as usize], camera::fixed24(1.3));
         let coverage = Some(coverage);
-        let query = Query { instance, rgb, weights: None, coverage, width: SIDE, height: SIDE, intrinsics, starts };
+        let query =
+            Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts };
         estimate(&Engine::cpu(), model, &[query], &Options::default(), |_| Ok(())).unwrap_err().to_string()
     };
     assert!(wrong(vec![0.5; 7]).contains("coverage of 784"));
@@ -234,7 +235,7 @@ fn masks_are_tried_dilated() {
         let rgb: Vec<f32> = (0..3 * side * side).map(colour).collect();
         let query = |coverage: Option<&Vec<f32>>| {
             let (rgb, coverage, starts) = (rgb.clone(), coverage.cloned(), vec![camera::fixed24(1.3)[10], truth]);
-            Query { instance, rgb, weights: None, coverage, width: SIDE, height: SIDE, intrinsics, starts }
+            Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
         };
         let phase = |steps, keep, dilate| Phase { steps, stride: 1, keep, light: false, dilate };
         let phases = vec![phase(0, 2, false), phase(2, 1, true), phase(1, 2, false)];
@@ -263,6 +264,19 @@ fn masks_are_tried_dilated() {
         let without = [(0, 1, 6), (0, 1, 6), (1, 1, 6)];
         let with = [(0, 3, 6), (0, 3, 5), (1, 3, 5), (2, 3, 5), (2, 3, 6), (3, 3, 6)];
         assert_eq!(steps, [without.as_slice(), &with].concat());
+
+        // What is known of the outline already, as from another frame, holds from the beginning; where dilations are tried, they are beside it.
+        let given = |by: f64| Query { dilation: by, ..query(Some(&coverage)) };
+        let plain = Options { phases: vec![phase(0, 2, false), phase(2, 1, false)], ..options.clone() };
+        let found = |query: Query, options: &Options| {
+            estimate(&engine, model, &[query], options, |_| Ok(())).map(|mut found| found.swap_remove(0))
+        };
+        let follow = found(given(known.dilation.unwrap()), &plain).unwrap();
+        assert_eq!((follow.dilation, follow.target), (known.dilation, known.target));
+        let again = found(given(-2.0), &options).unwrap().dilation.unwrap();
+        assert!(again < -0.5 && again > -1.5, "{engine}: {again}");
+        let error = found(given(f64::NAN), &plain).unwrap_err().to_string();
+        assert!(error.contains("dilated by NaN pixels"), "{error}");
     }
 }
 
@@ -287,6 +301,7 @@ fn an_object_is_found_without_its_name() {
             rgb,
             weights: None,
             coverage: None,
+            dilation: 0.0,
             width: SIDE,
             height: SIDE,
             intrinsics: intrinsics(),
@@ -321,8 +336,17 @@ fn second_derivatives_are_those_of_the_place() {
     let truth = camera::fixed24(1.3)[1];
     let rgb = picture(1, &truth);
     let starts = vec![glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2) * truth];
-    let query =
-        Query { instance: 1, rgb, weights: None, coverage: None, width: SIDE, height: SIDE, intrinsics: intrinsics(), starts };
+    let query = Query {
+        instance: 1,
+        rgb,
+        weights: None,
+        coverage: None,
+        dilation: 0.0,
+        width: SIDE,
+        height: SIDE,
+        intrinsics: intrinsics(),
+        starts,
+    };
     for engine in engines() {
         let phases = vec![Phase { steps: 15, stride: 1, keep: 1, light: false, dilate: false }];
         let options = Options { phases, min_starts: 0, seed: 0, ..Options::default() };
@@ -370,6 +394,7 @@ fn what_does_not_count_has_no_influence() {
         rgb: rgb.to_vec(),
         weights: weights.map(<[f32]>::to_vec),
         coverage: None,
+        dilation: 0.0,
         width: SIDE,
         height: SIDE,
         intrinsics: intrinsics(),

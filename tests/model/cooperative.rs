@@ -15,8 +15,17 @@ fn found(engine: &Engine) -> (f64, f64) {
     let rendering = Renderer::new(&Engine::cpu(), model, 1, SIDE, SIDE).unwrap().render(&[1], &[(truth, intrinsics)], 0).unwrap();
     let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2);
     let starts = vec![turn * truth];
-    let query =
-        Query { instance: 1, intrinsics, width: SIDE, height: SIDE, rgb: rendering.rgb, weights: None, coverage: None, starts };
+    let query = Query {
+        instance: 1,
+        intrinsics,
+        width: SIDE,
+        height: SIDE,
+        rgb: rendering.rgb,
+        weights: None,
+        coverage: None,
+        dilation: 0.0,
+        starts,
+    };
     let phases = vec![Phase { steps: 30, stride: 1, keep: usize::MAX, light: false, dilate: false }];
     let options = Options { method: Method::Bfgs { soft: 1.0 }, min_starts: 0, phases, seed: 0 };
     let estimate = estimate(engine, model, &[query], &options, |_| Ok(())).unwrap().remove(0);

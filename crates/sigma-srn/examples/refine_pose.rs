@@ -23,6 +23,7 @@ fn main() -> Result<(), sigma_srn::Error> {
         rgb,
         weights: None,
         coverage: None,
+        dilation: 0.0,
         width: SIDE,
         height: SIDE,
         intrinsics,

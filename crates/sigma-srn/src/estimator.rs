@@ -34,6 +34,9 @@ pub struct Query {
     /// How much of each pixel the object covers `[height, width]`, 0 to 1; the rest of it is white. Where it is known, a phase may make up
     /// for the light of the image, see [`Phase::light`], and for an outline that is not exact, see [`Phase::dilate`].
     pub coverage: Option<Vec<f32>>,
+    /// By how many pixels its outline is known to be too far in, or too far out where this is below zero: the search begins with the mask dilated by as
+    /// much. 0 where nothing is known.
+    pub dilation: f64,
     /// Pixels per row.
     pub width: u32,
     /// Rows.
@@ -56,7 +59,7 @@ pub struct Phase {
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`] is known: see [`Light`]. From wrong
     /// poses the light looks wrong, too.
     pub light: bool,
-    /// Whether masks are tried dilated and eroded by up to two pixels, where [`Query::coverage`] is known, with the best `keep` hypotheses; later phases
+    /// Whether masks are tried dilated and eroded by up to two pixels from [`Query::dilation`], where [`Query::coverage`] is known, with the best `keep` hypotheses; later phases
     /// compare with the one that leaves the least loss, see [`Estimate::dilation`]. Other hypotheses and other images wait: none is dropped.
     pub dilate: bool,
 }
@@ -192,7 +195,7 @@ pub struct Estimate {
     pub curvature: Option<[[f64; 6]; 6]>,
     /// The light of the image, if the last phase has made up for it.
     pub light: Option<Light>,
-    /// By how many pixels the mask of the image was dilated at the end, if that was tried: below zero where it was too large.
+    /// By how many pixels the mask of the image was dilated at the end, if that was tried or given: below zero where it was too large.
     pub dilation: Option<f64>,
     /// The image as it was compared at the end, dilated and in the model's light `[height, width, 3]`.
     pub target: Vec<f32>,
@@ -246,11 +249,12 @@ pub fn estimate(
     );
     let mut step = 0;
     let mut hypotheses: Vec<Hypothesis> = Vec::new();
-    let (mut lights, mut dilations) = (vec![None; queries.len()], vec![None; queries.len()]);
+    let mut lights = vec![None; queries.len()];
+    let mut dilations: Vec<Option<f64>> = queries.iter().map(|query| (query.dilation != 0.0).then_some(query.dilation)).collect();
     for (query, q) in queries.iter().enumerate() {
         let new = |(start, matrix)| {
             let pose = Pose6::from_matrix(matrix);
-            Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, phases: 0, dilation: 0.0 }
+            Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, phases: 0, dilation: q.dilation }
         };
         let around = (q.starts.len() < options.min_starts).then(|| q.starts.iter().flat_map(turned));
         let starts: Vec<DMat4> = q.starts.iter().copied().chain(around.into_iter().flatten()).collect();
@@ -275,7 +279,7 @@ pub fn estimate(
             let mut others = own.split_off(keep.min(own.len()));
             if phase.dilate {
                 others.iter_mut().for_each(|h| h.phases = number + 1);
-                own = own.iter().flat_map(|&h| DILATIONS.map(|dilation| Hypothesis { dilation, ..h })).collect();
+                own = own.iter().flat_map(|&h| DILATIONS.map(|by| Hypothesis { dilation: h.dilation + by, ..h })).collect();
             }
             running.extend(own);
             rest.extend(others);
@@ -331,7 +335,8 @@ pub fn estimate(
                 let own = running.chunks(DILATIONS.len()).filter(|tried| tried[0].query == query);
                 let best = own.min_by(|a, b| least(a).total_cmp(&least(b)));
                 let per_area = |h: &Hypothesis| h.loss / area(&queries[query], h.dilation);
-                *dilation = best.map(|tried| best_dilation(&tried.iter().map(per_area).collect::<Vec<_>>())).or(*dilation);
+                let by = best.map(|tried| best_dilation(&tried.iter().map(per_area).collect::<Vec<_>>()));
+                *dilation = by.map(|by| queries[query].dilation + by).or(*dilation);
             }
             let apart = |h: &&Hypothesis| (h.dilation - dilations[h.query].unwrap_or(0.0)).abs();
             let nearest = |tried: &[Hypothesis]| tried.iter().min_by(|a, b| apart(a).total_cmp(&apart(b))).copied();
@@ -495,6 +500,10 @@ fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Erro
         let pixels = query.rgb.len() / 3;
         if query.coverage.as_ref().is_some_and(|c| c.len() != pixels || c.iter().any(|cover| !(0.0..=1.0).contains(cover))) {
             return input(format!("needs a coverage of {pixels} values from 0 to 1"));
+        }
+        let side = f64::from(query.width.max(query.height));
+        if query.dilation.is_nan() || query.dilation.abs() > side {
+            return input(format!("a mask dilated by {} pixels, where the image has {side}", query.dilation));
         }
         if let Some(weights) = &query.weights {
             if weights.len() != pixels || weights.iter().any(|weight| !(0.0..f32::INFINITY).contains(weight)) {

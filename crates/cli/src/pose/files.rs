@@ -126,6 +126,8 @@ pub struct Picture {
     pub weights: Option<Vec<f32>>,
     /// How much of each pixel is the object `[side, side]`, where it was cut out; the rest of it is white.
     pub coverage: Option<Vec<f32>>,
+    /// By how many of these pixels its outline is known to be too far in; see [`sigma_srn::Query::dilation`].
+    pub dilation: f64,
     /// Intrinsics of the resampled picture.
     pub intrinsics: Intrinsics,
     /// Its true `world_from_camera`, if known.
@@ -168,6 +170,7 @@ impl Picture {
             rgb: target.rgb,
             weights: target.weights,
             coverage: target.coverage,
+            dilation: 0.0,
             intrinsics: Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 },
             truth: None,
             distance: target.cut.then(|| fx * SPAN * (1.0 + 2.0 * MARGIN) / f64::from(side)),

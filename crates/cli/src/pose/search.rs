@@ -373,6 +373,7 @@ fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
         rgb: picture.rgb.clone(),
         weights: picture.weights.clone(),
         coverage: picture.coverage.clone(),
+        dilation: picture.dilation,
         width: side,
         height: side,
         intrinsics: picture.intrinsics,
@@ -502,7 +503,18 @@ mod tests {
 
     fn picture(intrinsics: Intrinsics) -> Picture {
         let (name, square) = (String::new(), ([0; 2], 1));
-        Picture { name, instance: 0, rgb: vec![], weights: None, coverage: None, intrinsics, truth: None, square, distance: None }
+        Picture {
+            name,
+            instance: 0,
+            rgb: vec![],
+            weights: None,
+            coverage: None,
+            dilation: 0.0,
+            intrinsics,
+            truth: None,
+            square,
+            distance: None,
+        }
     }
 
     #[test]

@@ -429,6 +429,7 @@ mod tests {
             rgb: vec![],
             weights: None,
             coverage: None,
+            dilation: 0.0,
             intrinsics,
             truth: None,
             distance: None,

@@ -67,6 +67,8 @@ struct FrameReport<'a> {
     confidence: Option<Confidence>,
     /// The pose is not from that of the frame before, but was searched for all around.
     searched: bool,
+    /// By how many pixels of the frame its mask was dilated: below zero where it was too large.
+    mask_dilation_px: Option<f64>,
     error: Option<PoseError>,
     seconds: f64,
 }
@@ -85,16 +87,22 @@ pub fn run(args: &Track) -> Result<bool> {
     let all_around = args.search.options()?;
     // The next pose is near; what would have to be found from afar is searched for all around instead.
     let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, dilate: false };
-    let phases = vec![phase(5, 2, 2), phase(3, 1, 1)];
-    let from_frame_to_frame = Options { phases, min_starts: 0, ..all_around.clone() };
+    let phases = [phase(5, 2, 2), Phase { dilate: true, ..phase(5, 2, 1) }, phase(3, 1, 1)];
+    let with = |phases: &[Phase]| Options { phases: phases.to_vec(), min_starts: 0, ..all_around.clone() };
+    let (first, from_frame_to_frame) = (with(&phases), with(&[phases[0], phases[2]]));
 
     let mut animation = Vec::new();
     // The last two poses, the later one first.
     let mut before: Vec<DMat4> = Vec::new();
+    // By how many pixels of the frames their masks are too small, as far as that was tried: who cuts does it alike from frame to frame.
+    let mut dilation: Option<f64> = None;
     let (mut errors, mut searches, mut trusted) = (Vec::new(), 0, true);
     for (number, path) in frames.iter().enumerate() {
         let mask = args.mask.as_ref().map(|mask| mask_of(mask, path)).transpose()?;
-        let picture = Picture::open(path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
+        let mut picture =
+            Picture::open(path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
+        let frame_pixels = picture.square.1 as f64 / f64::from(side);
+        picture.dilation = dilation.unwrap_or(0.0) / frame_pixels;
         if let (0, Some(rough)) = (number, &args.rough) {
             before = vec![rough.read(path, &notation)?];
         }
@@ -104,6 +112,7 @@ pub fn run(args: &Track) -> Result<bool> {
         };
         let followed = match before[..] {
             [] => None,
+            [last] if dilation.is_none() => Some(run(&first, vec![last])?),
             [last] => Some(run(&from_frame_to_frame, vec![last])?),
             // It stands still, or goes on as it did.
             [last, earlier, ..] => Some(run(&from_frame_to_frame, vec![last, last * earlier.inverse() * last])?),
@@ -119,6 +128,9 @@ pub fn run(args: &Track) -> Result<bool> {
             }
         };
         trusted = found.is_trusted();
+        if trusted {
+            dilation = found.estimate.dilation.map(|by| by * frame_pixels).or(dilation);
+        }
         before.truncate(if searched { 0 } else { 1 });
         // Else what is not to be trusted is no place to go on from.
         if trusted || !searched {
@@ -141,6 +153,7 @@ pub fn run(args: &Track) -> Result<bool> {
             doubt: found.doubt,
             confidence: found.confidence,
             searched,
+            mask_dilation_px: found.estimate.dilation.map(|by| by * frame_pixels).or(dilation),
             error,
             seconds: found.seconds,
         };

@@ -95,7 +95,18 @@ pub fn picture(view: LoadedView, instance: u32, side: u32) -> (Picture, DMat4) {
     let LoadedView { name, rgb, .. } = view;
     let square = ([0; 2], side as usize);
     (
-        Picture { name, instance, rgb, weights: None, coverage: None, intrinsics, truth: Some(truth), distance: None, square },
+        Picture {
+            name,
+            instance,
+            rgb,
+            weights: None,
+            coverage: None,
+            dilation: 0.0,
+            intrinsics,
+            truth: Some(truth),
+            distance: None,
+            square,
+        },
         truth,
     )
 }
