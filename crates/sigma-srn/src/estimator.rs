@@ -59,8 +59,9 @@ pub struct Phase {
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`] is known: see [`Light`]. From wrong
     /// poses the light looks wrong, too.
     pub light: bool,
-    /// Whether masks are tried dilated and eroded by up to two pixels from [`Query::dilation`], where [`Query::coverage`] is known, with the best `keep` hypotheses; later phases
-    /// compare with the one that leaves the least loss, see [`Estimate::dilation`]. Other hypotheses and other images wait: none is dropped.
+    /// Whether masks are tried dilated and eroded by up to two pixels beside [`Query::dilation`], where [`Query::coverage`] is known, with the
+    /// best `keep` hypotheses; later phases compare with the one that leaves the least loss, see [`Estimate::dilation`]. Other hypotheses and
+    /// other images wait: none is dropped.
     pub dilate: bool,
 }
 

@@ -18,6 +18,9 @@ const SHOWN: u32 = 192;
 /// Seconds that it stays.
 const STAY: f64 = 0.1;
 
+/// Pixels that a mask may be off, as the model sees it: as far as a search tries. An object that comes from near to far has fewer pixels to lose.
+const WIDEST_RIM: f64 = 2.0;
+
 /// Flags of `sigma-pose track`.
 #[derive(Args, Debug)]
 pub struct Track {
@@ -102,7 +105,7 @@ pub fn run(args: &Track) -> Result<bool> {
         let mut picture =
             Picture::open(path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
         let frame_pixels = picture.square.1 as f64 / f64::from(side);
-        picture.dilation = dilation.unwrap_or(0.0) / frame_pixels;
+        picture.dilation = (dilation.unwrap_or(0.0) / frame_pixels).clamp(-WIDEST_RIM, WIDEST_RIM);
         if let (0, Some(rough)) = (number, &args.rough) {
             before = vec![rough.read(path, &notation)?];
         }
