@@ -318,9 +318,9 @@ fn an_object_is_found_without_its_name() {
         let apart = difference(&rendered(&found.model, 0), &query.rgb).unwrap();
         println!("instance {instance}: began with {}, {error:.2}° off, colours {apart:.1e} apart", found.nearest);
         assert_eq!((found.nearest, found.model.layout.instances), (instance, 1));
-        // After 280 to 350 steps of training 0.1° to 0.9° and 0.25 at most; a code that moves can stand in for a pose that does not, and with
-        // other numbers of steps does, up to 17°.
-        assert!(error < 3.0 && apart < 0.5, "{error}° {apart}");
+        // After 280 to 350 steps of training 0.1° to 0.9° and 0.25 at most with AVX-512, without it 0.3° to 3.0°; a code that moves can stand in for a pose
+        // that does not, and with other numbers of steps does, up to 17°.
+        assert!(error < 4.0 && apart < 0.5, "{error}° {apart}");
         let ranking = &found.estimate.ranking;
         assert!(ranking.is_sorted_by(|a, b| a.loss <= b.loss) && ranking[0].loss == found.estimate.loss, "{ranking:?}");
         assert_eq!((turns[0], turns.last()), ((0, turns.len()), Some(&(turns.len() - 1, turns.len()))));
@@ -374,6 +374,55 @@ fn second_derivatives_are_those_of_the_place() {
         let (of_estimate, of_way) = (apart(&found.curvature.unwrap()), apart(&learnt[0]));
         println!("{engine}: {of_estimate:.1e}, what the search has learnt on its way {of_way:.1e} apart");
         assert!(of_estimate < 1e-3 && of_way > 0.05, "{engine}: {of_estimate} {of_way}");
+    }
+}
+
+/// Where neither the picture nor the view shows anything, no rays are cast: the loss is that of the whole picture all the same, and hypotheses that show
+/// more of the object do not disturb those that show less.
+#[test]
+fn white_costs_nothing() {
+    const SIDE: u32 = 28;
+    let (ref model, instance, intrinsics) = shipped_forklift();
+    let truths = [2, 9].map(|k| camera::fixed24(1.3)[k]);
+    for engine in engines() {
+        let cameras = truths.map(|truth| (truth, intrinsics));
+        let shown = Renderer::new(&engine, model, 2, SIDE, SIDE).unwrap().render(&[instance; 2], &cameras, 0).unwrap().rgb;
+        let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.08);
+        let query = |k: usize| {
+            let rgb = shown.chunks(shown.len() / 2).nth(k).unwrap().iter().map(|c| c.clamp(-1.0, 1.0)).collect();
+            let starts = vec![turn * truths[k]];
+            Query { instance, rgb, weights: None, coverage: None, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
+        };
+        let search = |queries: &[Query], steps: u32| {
+            let phases = vec![Phase { steps, stride: 1, keep: 1, light: false, dilate: false }];
+            let options = Options { phases, min_starts: 0, ..Options::default() };
+            let mut flops = 0;
+            let found = estimate(&engine, model, queries, &options, |progress| {
+                flops = progress.descent.flops_per_step();
+                Ok(())
+            });
+            (found.unwrap(), flops)
+        };
+        // After one step the pose is still off: at its end the loss is hardly more than that of a white not quite white.
+        let (alone, flops) = search(&[query(0)], 1);
+
+        let shape = Shape { hypotheses: 1, width: SIDE, height: SIDE, instances: 1 };
+        let mut whole = Descent::new(&engine, model, shape, Options::default().method).unwrap();
+        let mut rays = Rays::default();
+        rays.push(&truths[0], &intrinsics, pixel_grid(SIDE, SIDE, 1), &mut stream(0, 0));
+        whole.set_targets(&[instance], &[0], &rays, &query(0).rgb, None).unwrap();
+        whole.set_poses(&[alone[0].pose]).unwrap();
+        whole.compare().unwrap();
+        let (loss, part) = (whole.losses().unwrap()[0], flops as f64 / whole.flops_per_step() as f64);
+        println!("{engine}: loss {:.3e}, of the whole picture {loss:.3e}; {part:.2} of the work", alone[0].loss);
+        assert!((alone[0].loss / loss - 1.0).abs() < 0.02 && part < 0.75, "{engine}");
+
+        let ((alone, _), (beside, _)) = (search(&[query(0)], 10), search(&[query(0), query(1)], 10));
+        for (found, truth) in zip(&beside, &truths) {
+            assert!(camera::pose_error(&found.pose.to_matrix(), truth).0 < 0.25, "{engine}");
+        }
+        let apart = camera::pose_error(&beside[0].pose.to_matrix(), &alone[0].pose.to_matrix()).0;
+        assert!(apart < 0.05, "{engine}: {apart}°");
     }
 }
 

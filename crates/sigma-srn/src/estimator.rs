@@ -13,6 +13,7 @@ use crate::light::Light;
 use crate::mask::{DILATIONS, best_dilation, dilated, has_outline};
 use crate::model::Model;
 use crate::random::{initial_depths, stream};
+use crate::region::region;
 use crate::{Error, Rays, pixel_grid};
 
 /// How far starts are turned that the search adds. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
@@ -52,7 +53,8 @@ pub struct Query {
 pub struct Phase {
     /// Steps; none: the poses are only compared with the image.
     pub steps: u32,
-    /// Every how many pixels, in both directions, a ray is cast.
+    /// Every how many pixels, in both directions, a ray is cast; with BFGS only near what the image or the view from a hypothesis's pose at the
+    /// beginning of the phase shows: where both are white nothing is to be seen.
     pub stride: u32,
     /// How many hypotheses of each image enter this phase: those with the lowest loss.
     pub keep: usize,
@@ -397,15 +399,121 @@ fn rays_of(query: &Query, stride: u32) -> impl Iterator<Item = (u32, u32)> {
     pixel_grid(query.width, query.height, stride)
 }
 
+/// Pixels of the rays.
+fn pixels_of(query: &Query, stride: u32) -> impl Iterator<Item = usize> {
+    rays_of(query, stride).map(|(u, v)| (v * query.width + u) as usize)
+}
+
 /// Weights of the rays, scaled to a mean of 1: losses of pictures with masks and without are then of one kind.
 fn weights_of(query: &Query, stride: u32) -> Vec<f32> {
-    let weight = |(u, v): (u32, u32)| query.weights.as_ref().map_or(1.0, |weights| weights[(v * query.width + u) as usize]);
-    let weights: Vec<f32> = rays_of(query, stride).map(weight).collect();
+    let weight = |pixel: usize| query.weights.as_ref().map_or(1.0, |weights| weights[pixel]);
+    let weights: Vec<f32> = pixels_of(query, stride).map(weight).collect();
     let mean = weights.iter().sum::<f32>() / weights.len() as f32;
     weights.into_iter().map(|weight| weight / mean).collect()
 }
 
-/// The descent of a phase, and the light of each query that it makes up for. The hypotheses of a query come one after the other, the best first.
+/// What the hypotheses of a phase are compared with; those of a query come one after the other, the best first.
+struct Targets {
+    shape: Shape,
+    /// The instances, and which of them each hypothesis shows.
+    instances: Vec<u32>,
+    slots: Vec<u32>,
+    rays: Rays,
+    /// `[hypotheses, rays, 3]`.
+    rgb: Vec<f32>,
+    /// `[hypotheses, rays]`, none where all rays count the same.
+    weights: Option<Vec<f32>>,
+}
+
+impl Targets {
+    /// On the whole grid of a phase.
+    fn new(queries: &[Query], phase: &Phase, running: &[Hypothesis], seed: u64) -> Self {
+        let mut instances: Vec<u32> = running.iter().map(|h| queries[h.query].instance).collect();
+        instances.sort_unstable();
+        instances.dedup();
+        let mut random = stream(seed, 0);
+        let (mut slots, mut rays, mut rgb, mut weights) = (Vec::new(), Rays::default(), Vec::new(), Vec::new());
+        for hypothesis in running {
+            let query = &queries[hypothesis.query];
+            slots.push(instances.binary_search(&query.instance).expect("collected above") as u32);
+            rays.push(&DMat4::IDENTITY, &query.intrinsics, rays_of(query, phase.stride), &mut random);
+            let (colours, _) = seen(query, hypothesis.dilation);
+            pixels_of(query, phase.stride).for_each(|pixel| rgb.extend_from_slice(&colours[3 * pixel..][..3]));
+            weights.extend(weights_of(query, phase.stride));
+        }
+        let across = |size: u32| (phase.stride / 2..size).step_by(phase.stride as usize).count() as u32;
+        let shape = Shape {
+            hypotheses: running.len() as u32,
+            width: across(queries[0].width),
+            height: across(queries[0].height),
+            instances: instances.len() as u32,
+        };
+        let weights = queries.iter().any(|query| query.weights.is_some()).then_some(weights);
+        Targets { shape, instances, slots, rays, rgb, weights }
+    }
+
+    fn rays_per_image(&self) -> usize {
+        (self.shape.width * self.shape.height) as usize
+    }
+
+    /// Makes up for the light of the image of each query, where its coverage is known: that between it and the view from the best pose.
+    fn undo_lights(&mut self, queries: &[Query], stride: u32, running: &[Hypothesis], renders: &[f32]) -> Vec<Option<Light>> {
+        let mut lights = vec![None; queries.len()];
+        let values = 3 * self.rays_per_image();
+        for ((hypothesis, render), rgb) in zip(running, renders.chunks(values)).zip(self.rgb.chunks_mut(values)) {
+            let query = &queries[hypothesis.query];
+            let (_, coverage) = seen(query, hypothesis.dilation);
+            if query.coverage.is_some() {
+                let coverage: Vec<f32> = pixels_of(query, stride).map(|pixel| coverage[pixel]).collect();
+                let between = || Light::between(rgb, render, &coverage, &weights_of(query, stride));
+                lights[hypothesis.query].get_or_insert_with(between).undo(rgb, &coverage);
+            }
+        }
+        lights
+    }
+
+    /// The same on the rays alone that are worth their time, see [`region`]; losses stay means over the whole grid. `None` if that is all of them, or none.
+    fn in_regions(&self, renders: &[f32]) -> Option<Self> {
+        let all = self.rays_per_image();
+        let weights = self.weights.clone().unwrap_or_else(|| vec![1.0; self.rgb.len() / 3]);
+        let each = zip(self.rgb.chunks(3 * all), renders.chunks(3 * all)).zip(weights.chunks(all));
+        let regions: Vec<Vec<usize>> =
+            each.map(|((rgb, render), weights)| region(rgb, render, weights, self.shape.width as usize)).collect();
+        let most = regions.iter().map(Vec::len).max()?;
+        if most == all || regions.iter().any(Vec::is_empty) {
+            return None;
+        }
+        let (mut uv, mut z0, mut rgb, mut counts) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        for (hypothesis, region) in regions.iter().enumerate() {
+            // Hypotheses have as many rays each: some of a small region are there more than once, and count once.
+            for (number, ray) in region.iter().cycle().take(most).enumerate() {
+                let ray = hypothesis * all + ray;
+                uv.extend_from_slice(&self.rays.uv[2 * ray..][..2]);
+                z0.push(self.rays.z0[ray]);
+                rgb.extend_from_slice(&self.rgb[3 * ray..][..3]);
+                counts.push(if number < region.len() { weights[ray] * most as f32 / all as f32 } else { 0.0 });
+            }
+        }
+        let (instances, slots, intrinsics) = (self.instances.clone(), self.slots.clone(), self.rays.intrinsics.clone());
+        let rays = Rays { world_from_camera: self.rays.world_from_camera.clone(), intrinsics, uv, z0 };
+        let shape = Shape { width: most as u32, height: 1, ..self.shape };
+        Some(Targets { shape, instances, slots, rays, rgb, weights: Some(counts) })
+    }
+
+    fn set(&self, descent: &mut Descent) -> Result<(), Error> {
+        descent.set_targets(&self.instances, &self.slots, &self.rays, &self.rgb, self.weights.as_deref())
+    }
+
+    fn descent(&self, engine: &Engine, model: &Model, method: Method, running: &[Hypothesis]) -> Result<Descent, Error> {
+        let mut descent = Descent::new(engine, model, self.shape, method)?;
+        self.set(&mut descent)?;
+        let poses: Vec<Pose6> = running.iter().map(|h| h.pose).collect();
+        descent.set_poses(&poses)?;
+        Ok(descent)
+    }
+}
+
+/// The descent of a phase, and the light of each query that it makes up for.
 fn prepare(
     engine: &Engine,
     model: &Model,
@@ -414,49 +522,27 @@ fn prepare(
     phase: &Phase,
     running: &[Hypothesis],
 ) -> Result<(Descent, Vec<Option<Light>>), Error> {
-    let mut instances: Vec<u32> = running.iter().map(|h| queries[h.query].instance).collect();
-    instances.sort_unstable();
-    instances.dedup();
-    let mut random = stream(options.seed, 0);
-    let (mut slots, mut rays, mut target, mut weights) = (Vec::new(), Rays::default(), Vec::new(), Vec::new());
-    let mut coverages: Vec<Vec<f32>> = Vec::new();
-    for hypothesis in running {
-        let query = &queries[hypothesis.query];
-        slots.push(instances.binary_search(&query.instance).expect("collected above") as u32);
-        rays.push(&DMat4::IDENTITY, &query.intrinsics, rays_of(query, phase.stride), &mut random);
-        let (rgb, coverage) = seen(query, hypothesis.dilation);
-        let pixels = || rays_of(query, phase.stride).map(|(u, v)| (v * query.width + u) as usize);
-        pixels().for_each(|pixel| target.extend_from_slice(&rgb[3 * pixel..][..3]));
-        coverages.push(if coverage.is_empty() { Vec::new() } else { pixels().map(|pixel| coverage[pixel]).collect() });
-        weights.extend(weights_of(query, phase.stride));
-    }
-    let across = |size: u32| (phase.stride / 2..size).step_by(phase.stride as usize).count() as u32;
-    let shape = Shape {
-        hypotheses: running.len() as u32,
-        width: across(queries[0].width),
-        height: across(queries[0].height),
-        instances: instances.len() as u32,
-    };
-    let mut descent = Descent::new(engine, model, shape, options.method)?;
-    let weighted = queries.iter().any(|query| query.weights.is_some());
-    descent.set_targets(&instances, &slots, &rays, &target, weighted.then_some(&weights))?;
-    let poses: Vec<Pose6> = running.iter().map(|h| h.pose).collect();
-    descent.set_poses(&poses)?;
-
+    let mut targets = Targets::new(queries, phase, running, options.seed);
+    let mut descent = targets.descent(engine, model, options.method, running)?;
     let mut lights = vec![None; queries.len()];
-    if phase.light && queries.iter().any(|query| query.coverage.is_some()) {
-        descent.compare()?;
-        let (renders, values) = (descent.rgb()?, target.len() / running.len());
-        let pictures = target.chunks_mut(values).zip(&coverages);
-        for ((hypothesis, render), (target, coverage)) in zip(running, renders.chunks(values)).zip(pictures) {
-            let query = &queries[hypothesis.query];
-            if query.coverage.is_some() {
-                let between = || Light::between(target, render, coverage, &weights_of(query, phase.stride));
-                let light = *lights[hypothesis.query].get_or_insert_with(between);
-                light.undo(target, coverage);
-            }
+    let makes_up = phase.light && queries.iter().any(|query| query.coverage.is_some());
+    // The paper's way compares whole images.
+    let looks_closer = phase.steps > 0 && matches!(options.method, Method::Bfgs { .. });
+    if !makes_up && !looks_closer {
+        return Ok((descent, lights));
+    }
+    descent.compare()?;
+    let renders = descent.rgb()?;
+    if makes_up {
+        lights = targets.undo_lights(queries, phase.stride, running, &renders);
+    }
+    match targets.in_regions(&renders).filter(|_| looks_closer) {
+        Some(targets) => {
+            // Its buffers, before there are others.
+            drop(descent);
+            descent = targets.descent(engine, model, options.method, running)?;
         }
-        descent.set_targets(&instances, &slots, &rays, &target, weighted.then_some(&weights))?;
+        None => targets.set(&mut descent)?,
     }
     Ok((descent, lights))
 }

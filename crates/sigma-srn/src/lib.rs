@@ -18,6 +18,7 @@ mod model;
 mod network;
 mod random;
 mod rays;
+mod region;
 mod renderer;
 mod torch;
 mod trainer;
