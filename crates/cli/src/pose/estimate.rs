@@ -276,7 +276,7 @@ fn report(
             doubt: found.doubt,
             confidence: found.confidence,
             light: found.estimate.light,
-            mask_dilation_px: found.estimate.dilation.map(|by| by * pictures[k].square.1 as f64 / f64::from(side)),
+            mask_dilation_px: found.estimate.dilation.map(|by| by * pictures[k].pixels_on_disk(side)),
             rival: found.estimate.rival().map(rival),
             searches: found.searches,
             start: found.estimate.ranking[0].start,

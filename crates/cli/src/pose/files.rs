@@ -139,6 +139,11 @@ pub struct Picture {
 }
 
 impl Picture {
+    /// How many of its pixels on disk, along a row, are one of the `side` that are compared.
+    pub fn pixels_on_disk(&self, side: u32) -> f64 {
+        self.square.1 as f64 / f64::from(side)
+    }
+
     /// Reads a picture as a square of `side` pixels. In an SRN folder the intrinsics and the instance's name are found beside it; a
     /// picture from elsewhere is cut around what its mask and transparency leave.
     pub fn open(

@@ -138,6 +138,9 @@ impl Page<'_> {
         let rgb = self.counted(&self.picture.rgb, [-0.2, -0.2, 0.2]);
         let mut captions = vec!["the picture given".into()];
         captions.extend(self.picture.weights.as_ref().map(|_| "blue-grey: masked out".into()));
+        let dilation = self.found.estimate.dilation.map(|by| by * self.picture.pixels_on_disk(self.side));
+        let outline = |by: f64| format!("mask {:.1} px too {}", by.abs(), if by < 0.0 { "large" } else { "small" });
+        captions.extend(dilation.filter(|by| *by != 0.0).map(outline));
         Panel { heading: "TARGET".into(), view: draw::view(&rgb, self.side, SHOWN), captions }
     }
 
@@ -165,7 +168,7 @@ impl Page<'_> {
         let top = 52 + 16 * scale;
         let below = top + shown + 6;
         let mut page = sheet::blank(width, below + 36 + plot_height);
-        let verdict = if self.found.is_trusted() { "pose found" } else { "not to be trusted" };
+        let verdict = self.found.doubt.map_or("pose found".into(), |doubt| format!("not to be trusted: {doubt}"));
         sheet::title(&mut page, GAP as i32, 12, &format!("{}: {verdict}", self.picture.name), scale, BLACK);
         let ranking = &self.found.estimate.ranking;
         let mut line = format!("start {} of {}", ranking[0].start, ranking.len());

@@ -104,7 +104,7 @@ pub fn run(args: &Track) -> Result<bool> {
         let mask = args.mask.as_ref().map(|mask| mask_of(mask, path)).transpose()?;
         let mut picture =
             Picture::open(path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
-        let frame_pixels = picture.square.1 as f64 / f64::from(side);
+        let frame_pixels = picture.pixels_on_disk(side);
         picture.dilation = (dilation.unwrap_or(0.0) / frame_pixels).clamp(-WIDEST_RIM, WIDEST_RIM);
         if let (0, Some(rough)) = (number, &args.rough) {
             before = vec![rough.read(path, &notation)?];
