@@ -216,7 +216,7 @@ pub struct Progress<'a> {
     pub steps: u32,
     /// `(query, start)` of each hypothesis in the running phase.
     pub hypotheses: &'a [(usize, usize)],
-    /// The running descent; reading from it waits for the device.
+    /// The running descent; reading from it waits for the device. With BFGS its rays are no whole image, but those near what is to be seen.
     pub descent: &'a mut Descent,
 }
 
