@@ -4,7 +4,7 @@
 /// A channel below this is not white; a network's background is within a hundredth of it.
 const WHITE: f32 = 0.98;
 
-/// How far around what is shown rays are cast, as a part of the picture's width.
+/// How far around what is shown rays are cast, as a part of the picture's width; two rays at least.
 const MARGIN: f64 = 1.0 / 32.0;
 
 /// The rays of a hypothesis that are worth their time, by number, of those of its grid. `target` and `render [rays, 3]`, `weights [rays]`, `width`
