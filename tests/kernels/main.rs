@@ -2,7 +2,7 @@
 //!
 //! `<op>.rs` holds a [`KernelTest`] and a test for each direction of an op. Sizes are odd, groups several, outputs poisoned.
 
-use srn_cpu::CpuExecutor;
+use srn_cpu::Precision;
 use srn_gpu::{Choice, Gpu, GpuExecutor, wgpu};
 use srn_plan::{Executor, ExecutorError, Kernel, Rows};
 use srn_shaders::{Requirement, TABLE, Variant};
@@ -106,8 +106,9 @@ impl KernelTest {
     /// computed.
     fn matches_reference(&self) {
         for case in (self.cases)() {
-            let mut executor = CpuExecutor::<f32>::new(case.plan.clone(), u64::MAX).expect("every kernel has a reference");
-            self.worst(&case, &mut executor).unwrap_or_else(|what| panic!("{} on the CPU: {what}", case.name));
+            let mut executor =
+                srn_cpu::executor(Precision::F32, case.plan.clone(), u64::MAX).expect("every kernel has a reference");
+            self.worst(&case, executor.as_mut()).unwrap_or_else(|what| panic!("{} on the CPU: {what}", case.name));
         }
         for variant in self.kernel.variants {
             // What the device cannot run has no turn.
@@ -139,11 +140,11 @@ impl KernelTest {
     }
 
     fn worst(&self, case: &Case, executor: &mut dyn Executor) -> Result<f64, Divergence> {
-        let mut reference = CpuExecutor::<f64>::new(case.plan.clone(), u64::MAX).expect("every kernel has a reference");
-        case.fill(&mut reference).expect("filling the reference");
+        let mut reference = srn_cpu::executor(Precision::F64, case.plan.clone(), u64::MAX).expect("every kernel has a reference");
+        case.fill(reference.as_mut()).expect("filling the reference");
         case.fill(executor).expect("filling the device");
         let tolerance = |kernel: &Kernel| (kernel.name == self.kernel.name).then_some(self.tolerance);
-        let worst = lockstep(executor, &mut reference, case.stage, tolerance)?;
+        let worst = lockstep(executor, reference.as_mut(), case.stage, tolerance)?;
         Ok(worst[self.kernel.name])
     }
 

@@ -137,7 +137,7 @@ fn poses_near_the_truth_come_nearer() {
         let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2);
         let starts: Vec<Pose6> = truths.iter().map(|truth| Pose6::from_matrix(&(turn * *truth))).collect();
         descent.set_poses(&starts).unwrap();
-        for _ in 0..60 {
+        for _ in 0..30 {
             descent.evaluate().unwrap();
             descent.descend().unwrap();
         }
@@ -145,7 +145,7 @@ fn poses_near_the_truth_come_nearer() {
         let error = |(_, pose): &(f64, Pose6), truth| camera::pose_error(&pose.to_matrix(), truth).0;
         let errors: Vec<f64> = ends.iter().zip(&truths).map(|(end, truth)| error(end, truth)).collect();
         println!("{engine}: {errors:.2?}");
-        // Some of pictures as small as these lead elsewhere from 11° away. Measured: 17 on the CPU, 14 on llvmpipe.
+        // Some of pictures as small as these lead elsewhere from 11° away. Measured: 14 on the CPU, 15 on llvmpipe.
         let found = errors.iter().filter(|&&error| error < 1.0).count();
         assert!(found >= 10, "{engine}: {found} of 24");
     }
@@ -181,7 +181,7 @@ fn light_is_made_up_for() {
             let (coverage, starts) = (is_known.then_some(coverage), vec![turn * truths[k]]);
             Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
         };
-        let phases = [10, 10].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, dilate: false }).into();
+        let phases = [6, 6].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, dilate: false }).into();
         let options = Options { phases, min_starts: 0, ..Options::default() };
         let search = |queries: &[Query]| estimate(&engine, model, queries, &options, |_| Ok(())).unwrap();
         let [unknown, known] = [false, true].map(|is_known| search(&[0, 1, 2].map(|k| query(k, is_known))));
@@ -191,7 +191,7 @@ fn light_is_made_up_for() {
         });
         let contrasts: Vec<f32> = known.iter().map(|found| found.light.unwrap().contrast).collect();
         println!("{engine}: {errors:.2?}°, without it {off:.2?}°; contrasts {contrasts:.2?}");
-        // Measured: 0.09° at most, where without it one is 0.3° off on one processor and 0.5° on another, and all together 2.0°.
+        // Measured: 0.11° at most, where without it all together are 1.9° off and more.
         assert!(errors.iter().all(|error| *error < 0.25), "{engine}");
         assert!(off.iter().sum::<f64>() > 4.0 * errors.iter().sum::<f64>(), "{engine}");
         assert!(contrasts.iter().all(|contrast| (contrast - 2.0).abs() < 0.15), "{engine}");

@@ -149,9 +149,28 @@ impl<'a, T> Part<'a, T> {
     }
 }
 
-/// Runs a plan on the CPU in `T`, with all threads of the current rayon pool.
+/// What the CPU computes in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// The fallback for a machine without a GPU.
+    F32,
+    /// The oracle of the tests.
+    F64,
+}
+
+/// An executor that runs a plan on the CPU, with all threads of the current rayon pool. Its buffers are zeros; fails where they exceed `budget`
+/// bytes or a kernel has no reference.
+// No type that is generic goes out: each crate that uses one compiles all references anew, half a minute of each build.
+pub fn executor(precision: Precision, plan: Plan, budget: u64) -> Result<Box<dyn Executor>, ExecutorError> {
+    Ok(match precision {
+        Precision::F32 => Box::new(CpuExecutor::<f32>::new(plan, budget)?),
+        Precision::F64 => Box::new(CpuExecutor::<f64>::new(plan, budget)?),
+    })
+}
+
+/// Runs a plan in `T`.
 #[derive(Debug)]
-pub struct CpuExecutor<T> {
+struct CpuExecutor<T> {
     plan: Plan,
     /// Of each stage.
     chains: Vec<Vec<Chain>>,
@@ -159,8 +178,7 @@ pub struct CpuExecutor<T> {
 }
 
 impl<T: Real> CpuExecutor<T> {
-    /// Allocates the plan's buffers as zeros; fails where they exceed `budget` bytes or a kernel has no reference.
-    pub fn new(plan: Plan, budget: u64) -> Result<Self, ExecutorError> {
+    fn new(plan: Plan, budget: u64) -> Result<Self, ExecutorError> {
         let needed = plan.bytes() / 4 * size_of::<T>() as u64;
         if needed > budget {
             return Err(ExecutorError::Memory { needed, budget });

@@ -13,5 +13,5 @@ mod real;
 mod simd;
 
 pub use chain::{part_rows, rows_for_all_threads};
-pub use executor::CpuExecutor;
+pub use executor::{Precision, executor};
 pub use real::Real;

@@ -161,7 +161,7 @@ impl Descent {
     pub fn profile(&mut self) -> Result<Option<Vec<srn_gpu::KernelTime>>, Error> {
         match &mut self.runner {
             Runner::Gpu(executor) => Ok(Some(executor.profile(self.handles.evaluate)?)),
-            Runner::Cpu(_) | Runner::CpuF64(_) => Ok(None),
+            Runner::Cpu(_) => Ok(None),
         }
     }
 

@@ -4,7 +4,7 @@ use std::iter::zip;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
-use srn_cpu::CpuExecutor;
+use srn_cpu::Precision;
 use srn_gpu::{Gpu, GpuExecutor};
 use srn_plan::ops::linear::{self, Layer, Sets};
 use srn_plan::{Builder, Executor, ExecutorError, Plan, PlanError, Rows};
@@ -27,8 +27,7 @@ const COOPERATIVE_LIMIT: f64 = 0.01;
 /// What computes.
 #[derive(Clone, Debug)]
 enum Kind {
-    Cpu,
-    CpuF64,
+    Cpu(Precision),
     Gpu(Gpu),
 }
 
@@ -46,12 +45,12 @@ pub struct Engine {
 impl Engine {
     /// The CPU in `f32`, with all threads of the current rayon pool.
     pub fn cpu() -> Self {
-        Engine { kind: Kind::Cpu, budget: CPU_BUDGET, tile_rows: None, cooperative: None }
+        Engine { kind: Kind::Cpu(Precision::F32), budget: CPU_BUDGET, tile_rows: None, cooperative: None }
     }
 
     /// The CPU in `f64`: the oracle of the tests.
     pub fn cpu_f64() -> Self {
-        Engine { kind: Kind::CpuF64, ..Self::cpu() }
+        Engine { kind: Kind::Cpu(Precision::F64), ..Self::cpu() }
     }
 
     /// A GPU, or a software adapter: opened by [`Gpu::open`], or made from the caller's device by [`Gpu::from_device`].
@@ -133,7 +132,7 @@ impl Engine {
     pub fn as_gpu(&self) -> Option<&Gpu> {
         match &self.kind {
             Kind::Gpu(gpu) => Some(gpu),
-            Kind::Cpu | Kind::CpuF64 => None,
+            Kind::Cpu(_) => None,
         }
     }
 
@@ -141,13 +140,13 @@ impl Engine {
     pub(crate) fn max_binding_bytes(&self) -> u64 {
         match &self.kind {
             Kind::Gpu(gpu) => gpu.max_binding_bytes(),
-            Kind::Cpu | Kind::CpuF64 => u64::MAX,
+            Kind::Cpu(_) => u64::MAX,
         }
     }
 
     /// Bytes that a value of a plan takes.
     pub(crate) fn value_bytes(&self) -> u64 {
-        if matches!(self.kind, Kind::CpuF64) { 8 } else { 4 }
+        if matches!(self.kind, Kind::Cpu(Precision::F64)) { 8 } else { 4 }
     }
 
     /// A builder with this engine's limits.
@@ -167,7 +166,7 @@ impl Engine {
             Kind::Gpu(gpu) if gpu.adapter().is_software => SOFTWARE_TILE_ROWS,
             Kind::Gpu(_) => GPU_TILE_ROWS,
             // What is kept for the way back stays in the caches.
-            Kind::Cpu | Kind::CpuF64 => srn_cpu::rows_for_all_threads(features as usize) as u32,
+            Kind::Cpu(_) => srn_cpu::rows_for_all_threads(features as usize) as u32,
         });
         let mut tile_rows = rows.min(preferred).max(1);
         loop {
@@ -190,7 +189,7 @@ impl Engine {
     pub(crate) fn part_rows(&self, tile_rows: u32, features: u32) -> u32 {
         match self.kind {
             Kind::Gpu(_) => GPU_PART_ROWS,
-            Kind::Cpu | Kind::CpuF64 => srn_cpu::part_rows(tile_rows as usize, features as usize) as u32,
+            Kind::Cpu(_) => srn_cpu::part_rows(tile_rows as usize, features as usize) as u32,
         }
     }
 
@@ -201,8 +200,7 @@ impl Engine {
     /// Makes a plan ready to run.
     pub(crate) fn prepare(&self, plan: Plan) -> Result<Runner, ExecutorError> {
         Ok(match &self.kind {
-            Kind::Cpu => Runner::Cpu(CpuExecutor::new(plan, self.budget)?),
-            Kind::CpuF64 => Runner::CpuF64(CpuExecutor::new(plan, self.budget)?),
+            Kind::Cpu(precision) => Runner::Cpu(srn_cpu::executor(*precision, plan, self.budget)?),
             Kind::Gpu(gpu) => Runner::Gpu(GpuExecutor::new(&gpu.without_cooperative(), plan, self.budget)?),
         })
     }
@@ -243,8 +241,8 @@ impl Engine {
 impl std::fmt::Display for Engine {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match &self.kind {
-            Kind::Cpu => write!(f, "cpu"),
-            Kind::CpuF64 => write!(f, "cpu64"),
+            Kind::Cpu(Precision::F32) => write!(f, "cpu"),
+            Kind::Cpu(Precision::F64) => write!(f, "cpu64"),
             Kind::Gpu(gpu) if self.is_cooperative() => write!(f, "{}, cooperative matrices", gpu.adapter().name),
             Kind::Gpu(gpu) => write!(f, "{}", gpu.adapter().name),
         }
@@ -253,8 +251,7 @@ impl std::fmt::Display for Engine {
 
 /// A plan on its executor.
 pub(crate) enum Runner {
-    Cpu(CpuExecutor<f32>),
-    CpuF64(CpuExecutor<f64>),
+    Cpu(Box<dyn Executor>),
     Gpu(GpuExecutor),
 }
 
@@ -263,7 +260,7 @@ impl Runner {
     pub fn as_gpu(&self) -> Option<&GpuExecutor> {
         match self {
             Runner::Gpu(executor) => Some(executor),
-            Runner::Cpu(_) | Runner::CpuF64(_) => None,
+            Runner::Cpu(_) => None,
         }
     }
 }
@@ -273,8 +270,7 @@ impl std::ops::Deref for Runner {
 
     fn deref(&self) -> &Self::Target {
         match self {
-            Runner::Cpu(executor) => executor,
-            Runner::CpuF64(executor) => executor,
+            Runner::Cpu(executor) => executor.as_ref(),
             Runner::Gpu(executor) => executor,
         }
     }
@@ -283,8 +279,7 @@ impl std::ops::Deref for Runner {
 impl std::ops::DerefMut for Runner {
     fn deref_mut(&mut self) -> &mut Self::Target {
         match self {
-            Runner::Cpu(executor) => executor,
-            Runner::CpuF64(executor) => executor,
+            Runner::Cpu(executor) => executor.as_mut(),
             Runner::Gpu(executor) => executor,
         }
     }
