@@ -129,21 +129,22 @@ impl Options {
     }
 
     /// The same with `steps` steps in all, shared between the phases in their present proportions; those that try dilations have as many more or fewer,
-    /// and come on top.
+    /// and come on top. Where there are any at all, a phase whose share is none is left out.
     pub fn with_steps(mut self, steps: u32) -> Self {
         let total = self.phases.iter().filter(|phase| !phase.dilate).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
         let share = |of: u64| (2 * of * u64::from(steps) + total) / (2 * total);
         let (mut before, mut done) = (0, 0);
-        for phase in &mut self.phases {
+        self.phases.retain_mut(|phase| {
             let present = u64::from(phase.steps);
             if phase.dilate {
                 phase.steps = share(present) as u32;
-                continue;
+            } else {
+                before += present;
+                phase.steps = (share(before) - done) as u32;
+                done = share(before);
             }
-            before += present;
-            phase.steps = (share(before) - done) as u32;
-            done = share(before);
-        }
+            phase.steps > 0 || present == 0 || phase.dilate || steps == 0
+        });
         self
     }
 
@@ -640,6 +641,10 @@ mod tests {
         }
         let total = all(&default);
         assert_eq!(default.clone().with_steps(total), default);
+        // A look at all starts, dilations, and the phase that has the step.
+        let one: Vec<(u32, u32)> = default.clone().with_steps(1).phases.iter().map(|phase| (phase.steps, phase.stride)).collect();
+        assert_eq!(one, [(0, 4), (0, 2), (1, 1)]);
+        assert_eq!(default.clone().with_steps(0).phases.len(), default.phases.len());
         let keeps = |options: &Options| options.phases.iter().map(|phase| (phase.steps, phase.keep)).collect::<Vec<_>>();
         assert_eq!(keeps(&Options::paper().with_culling()), [(60, usize::MAX), (240, 6)]);
         assert_eq!(default.clone().with_culling(), default);
