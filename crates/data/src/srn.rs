@@ -202,15 +202,19 @@ pub fn read_pose(path: &Path) -> Result<DMat4> {
     rigid(path, "pose", read_pose_unchecked(path)?)
 }
 
-/// Reads a file of poses, one per line as in a pose file; empty lines and those that begin with `#` are left out. At least one.
+/// Reads a file of poses, one per line as in a pose file, or each as four lines of four numbers; empty lines and those that begin with `#` are left out.
+/// At least one.
 pub fn read_poses(path: &Path) -> Result<Vec<DMat4>> {
     let text = read_text(path)?;
     let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
-    let pose = |(i, line)| {
-        let field = format!("line {}", i + 1);
-        rigid(path, &field, matrix(path, &field, line)?)
+    let lines: Vec<(usize, &str)> = lines.collect();
+    let are_rows = lines.iter().all(|(_, line)| line.split_whitespace().count() == 4);
+    let pose = |lines: &[(usize, &str)]| {
+        let field = format!("line {}", lines[0].0 + 1);
+        let text: Vec<&str> = lines.iter().map(|(_, line)| *line).collect();
+        rigid(path, &field, matrix(path, &field, &text.join(" "))?)
     };
-    let poses: Vec<_> = lines.map(pose).collect::<Result<_>>()?;
+    let poses: Vec<_> = lines.chunks(if are_rows { 4 } else { 1 }).map(pose).collect::<Result<_>>()?;
     if poses.is_empty() { Err(Error::field(path, "poses", "at least one line of 16 numbers", "none")) } else { Ok(poses) }
 }
 
@@ -479,10 +483,17 @@ mod tests {
 
         let line = "0 0 1 -2 -1 0 0 0 0 -1 0 0 0 0 0 1";
         write(&path, format!("# two poses\n{line}\n\n  {line}\n")).unwrap();
-        assert_eq!(read_poses(&path).unwrap().len(), 2);
-        for (text, words) in
-            [("# none", "at least one"), ("1 2 3", "line 1: expected 16"), (&line.replace("-2", "NaN"), "finite")]
-        {
+        let poses = read_poses(&path).unwrap();
+        assert_eq!(poses.len(), 2);
+        let rows = "0 0 1 -2\n-1 0 0 0\n0 -1 0 0\n0 0 0 1\n";
+        write(&path, format!("{rows}\n# the other\n{rows}")).unwrap();
+        assert_eq!(read_poses(&path).unwrap(), poses);
+        for (text, words) in [
+            ("# none", "at least one"),
+            ("1 2 3", "line 1: expected 16"),
+            (&line.replace("-2", "NaN"), "finite"),
+            (&format!("{rows}1 2 3 4"), "line 5: expected 16"),
+        ] {
             write(&path, text).unwrap();
             let error = read_poses(&path).unwrap_err().to_string();
             assert!(error.contains("pose.txt") && error.contains(words), "{error}");

@@ -37,7 +37,7 @@ pub struct Estimate {
     #[arg(long, value_name = "FILE|DIR")]
     mask: Vec<PathBuf>,
     /// Where to start: `around84`, all around; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file
-    /// with 16 numbers per line, a `world_from_camera` each. Default: `neighbor4` with --rough, else `around84`.
+    /// with 16 numbers per line, or in four lines, a `world_from_camera` each. Default: `neighbor4` with --rough, else `around84`.
     #[arg(long, value_name = "around84|fixed24|neighbor4|FILE")]
     starts: Option<Starts>,
     /// Roughly known pose: a pose file, or `auto`, the one in the picture's SRN folder. Once, or once per picture.

@@ -34,7 +34,7 @@ pub struct Evaluate {
     #[arg(long, value_name = "DIR")]
     pub(super) data: PathBuf,
     /// Where to start: `neighbor4`, the true pose turned by 30° to four sides; `around84`, all around; `fixed24`, the paper's fewer;
-    /// or a file with 16 numbers per line, a `world_from_camera` each.
+    /// or a file with 16 numbers per line, or in four lines, a `world_from_camera` each.
     #[arg(long, value_name = "neighbor4|around84|fixed24|FILE", default_value = "neighbor4")]
     pub(super) starts: Starts,
     /// Views of each instance, evenly spread over those that there are.
