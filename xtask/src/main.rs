@@ -52,15 +52,20 @@ const COMMANDS: &[Command] = &[
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let Some((name, rest)) = arguments.split_first() else {
-        usage();
+    let asks = |argument: &String| ["--help", "-h"].contains(&argument.as_str());
+    let Some((name, rest)) = arguments.split_first().filter(|(name, _)| !asks(name)) else {
+        usage(COMMANDS);
         return ExitCode::SUCCESS;
     };
     let Some(command) = COMMANDS.iter().find(|command| command.name == name) else {
         eprintln!("error: no command is called `{name}`");
-        usage();
+        usage(COMMANDS);
         return ExitCode::from(2);
     };
+    if rest.iter().any(asks) {
+        usage(std::slice::from_ref(command));
+        return ExitCode::SUCCESS;
+    }
     match (command.run)(rest) {
         Ok(()) => ExitCode::SUCCESS,
         Err(what) => {
@@ -70,9 +75,9 @@ fn main() -> ExitCode {
     }
 }
 
-fn usage() {
+fn usage(commands: &[Command]) {
     println!("cargo xtask COMMAND\n");
-    for command in COMMANDS {
+    for command in commands {
         println!("  {:<40} {}", format!("{} {}", command.name, command.arguments), command.about);
     }
 }
