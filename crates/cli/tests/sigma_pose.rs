@@ -675,7 +675,7 @@ fn a_baked_model_is_a_model() {
     assert!(rotation < 0.01 && translation < 1e-4, "{rotation}° {translation}");
     fs::copy(dir.join("model.png"), dir.join("photo.png")).unwrap();
     let photo = "estimate photo.png --fov 46.5 --executor cpu --steps 1 --accept 1e9 --model";
-    fail(dir, &format!("{photo} model.safetensors"), &["photo.png", "which object", "--instance"]);
+    fail(dir, &format!("{photo} model.safetensors"), &["photo.png", "which object", "--instance", "chicken"]);
     assert!(run(dir, &format!("{photo} chicken.safetensors"), 0).contains("photo"));
     let evaluate = "evaluate --model chicken.safetensors --data DATA --views 1 --steps 2 --executor cpu";
     assert!(run(dir, evaluate, 0).contains("chicken"));

@@ -539,8 +539,18 @@ impl Model {
         let by_number = || name.parse().ok().filter(|&number: &usize| number < self.layout.instances as usize);
         by_name.or_else(by_number).map(|number| number as u32).ok_or_else(|| Error::Input {
             input: format!("instance `{name}`"),
-            what: format!("the model knows {} instances: {}", self.layout.instances, self.metadata.instance_names.join(", ")),
+            what: format!("the model knows {}", self.known_instances()),
         })
+    }
+
+    /// How many instances there are, and their names, in words.
+    pub fn known_instances(&self) -> String {
+        let (count, names) = (self.layout.instances, &self.metadata.instance_names);
+        if names.is_empty() {
+            format!("{count} instances, by number")
+        } else {
+            format!("{count} instances: {}", names.join(", "))
+        }
     }
 
     /// Name of instance `number`: from the file, or the number itself.

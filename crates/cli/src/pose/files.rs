@@ -101,7 +101,7 @@ pub fn instance_of(model: &Model, name: Option<&str>) -> Result<u32> {
     match name {
         Some(name) => Ok(model.instance(name)?),
         None if model.layout.instances == 1 => Ok(0),
-        None => Err("which object is it? Give --instance".into()),
+        None => Err(format!("which object is it? Give --instance; the model knows {}", model.known_instances()).into()),
     }
 }
 
