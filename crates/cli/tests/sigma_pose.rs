@@ -1,8 +1,9 @@
 //! `sigma-pose` as a user runs it: results, pictures, exit codes, what is never overwritten. The model is untrained and tiny.
 
 use std::fs;
+use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use glam::DMat4;
 use serde_json::Value;
@@ -192,7 +193,7 @@ fn frames_are_followed() {
     assert_eq!(lines.len(), 20);
     assert!(lines.iter().all(|line| line["searched"] == false && line["trusted"] == true && line["error"].is_object()));
     assert!(lines[3]["frame"].as_str().unwrap().ends_with("000003.png"));
-    let animation = std::io::BufReader::new(fs::File::open(dir.join("frames.gif")).unwrap());
+    let animation = BufReader::new(fs::File::open(dir.join("frames.gif")).unwrap());
     let animation = image::AnimationDecoder::into_frames(image::codecs::gif::GifDecoder::new(animation).unwrap());
     assert_eq!(animation.count(), 20);
     fail(dir, &format!("{frames} --record frames.gif"), &["frames.gif", "--force"]);
@@ -202,6 +203,31 @@ fn frames_are_followed() {
     let two = format!("track DATA/{CHICKEN} DATA/chicken/rgb/000004.png --model model.safetensors --executor cpu --steps 2");
     let lines = run(dir, &format!("{two} --accept 1e-9"), 1);
     assert_eq!((lines.matches("searched all around").count(), lines.matches("DO NOT TRUST").count()), (2, 2), "{lines}");
+}
+
+/// Who writes frames as they come gets an answer to each before the next one is there.
+#[test]
+fn frames_come_on_stdin() {
+    let home = home();
+    let args = "track - --model model.safetensors --executor cpu --steps 1 --rough auto --accept 1e9 --json";
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sigma-pose"));
+    command.current_dir(home.path()).args(args.split(' ')).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut tracking = command.spawn().unwrap();
+    let (mut frames, mut poses) = (tracking.stdin.take().unwrap(), BufReader::new(tracking.stdout.take().unwrap()).lines());
+    for frame in ["000003.png", "000004.png"] {
+        let path = format!("{TEST}/chicken/rgb/{frame}");
+        // Blank lines are none.
+        writeln!(frames, "{path}\n").unwrap();
+        let answer: Value = serde_json::from_str(&poses.next().unwrap().unwrap()).unwrap();
+        assert_eq!((answer["frame"].as_str(), &answer["searched"]), (Some(&path[..]), &Value::Bool(false)));
+    }
+    writeln!(frames, "no-such.png").unwrap();
+    drop(frames);
+    let ended = tracking.wait_with_output().unwrap();
+    assert!(poses.next().is_none() && String::from_utf8_lossy(&ended.stderr).contains("no-such.png"));
+    assert_eq!(ended.status.code(), Some(2));
+    // Nothing comes.
+    fail(home.path(), args, &["stdin", "no frame"]);
 }
 
 /// The tables of one instance: every preset and loss, all files, nothing overwritten.
@@ -252,7 +278,7 @@ fn records_are_written_once() {
     assert_eq!(files(&dir.join("pictures")), written);
     let page = image::open(dir.join("pictures/chicken-000003.png")).unwrap();
     assert!(page.width() > 1000 && page.height() > 400);
-    let animation = std::io::BufReader::new(fs::File::open(dir.join("pictures/chicken-000003.gif")).unwrap());
+    let animation = BufReader::new(fs::File::open(dir.join("pictures/chicken-000003.gif")).unwrap());
     let frames = image::AnimationDecoder::into_frames(image::codecs::gif::GifDecoder::new(animation).unwrap());
     assert!(frames.count() > 3);
 
@@ -422,7 +448,7 @@ fn render_makes_pictures_animations_and_folders() {
     render("--out depth.png --depth --pose DATA/seat/pose/000004.txt --fov 40");
     assert_eq!(image::image_dimensions(dir.join("depth.png")).unwrap(), (16, 16));
     render("--out orbit.gif --orbit 10 --radius 1.5");
-    let animation = std::io::BufReader::new(fs::File::open(dir.join("orbit.gif")).unwrap());
+    let animation = BufReader::new(fs::File::open(dir.join("orbit.gif")).unwrap());
     assert_eq!(image::AnimationDecoder::into_frames(image::codecs::gif::GifDecoder::new(animation).unwrap()).count(), 10);
 
     // A folder is an instance: its intrinsics and poses are those of the pictures.

@@ -24,8 +24,9 @@ const WIDEST_RIM: f64 = 2.0;
 /// Flags of `sigma-pose track`.
 #[derive(Args, Debug)]
 pub struct Track {
-    /// Frames in order, as `estimate` takes them; or a folder, whose pictures are taken by name.
-    #[arg(required = true, value_name = "FRAME|DIR")]
+    /// Frames in order, as `estimate` takes them; or a folder, whose pictures are taken by name; or `-`: their paths come on stdin, one per
+    /// line, and each is answered before the next is read.
+    #[arg(required = true, value_name = "FRAME|DIR|-")]
     frames: Vec<PathBuf>,
     #[command(flatten)]
     object: ObjectArgs,
@@ -79,43 +80,47 @@ struct FrameReport<'a> {
 /// Runs the command; false where the last pose is not to be trusted.
 pub fn run(args: &Track) -> Result<bool> {
     let model = load_model(&args.object.model)?;
-    let frames = frames(&args.frames)?;
-    let side = model_side(&model, &frames[0])?;
+    let mut frames = frames(&args.frames)?;
     let notation = args.poses.open()?;
     if let Some(path) = &args.record {
         refuse_existing([path.clone()], args.force)?;
     }
     let engine = args.search.open(&args.engine)?;
+    // Whoever waits for a frame is ready for it.
+    let first = frames.next().ok_or("stdin: no frame's path on it")??;
+    let side = model_side(&model, &first)?;
     let on = On { engine: &engine, model: &model, side };
     let all_around = args.search.options()?;
     // The next pose is near; what would have to be found from afar is searched for all around instead.
     let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, dilate: false };
     let phases = [phase(5, 2, 2), Phase { dilate: true, ..phase(5, 2, 1) }, phase(3, 1, 1)];
     let with = |phases: &[Phase]| Options { phases: phases.to_vec(), min_starts: 0, ..all_around.clone() };
-    let (first, from_frame_to_frame) = (with(&phases), with(&[phases[0], phases[2]]));
+    let (with_mask, from_frame_to_frame) = (with(&phases), with(&[phases[0], phases[2]]));
 
     let mut animation = Vec::new();
     // The last two poses, the later one first.
     let mut before: Vec<DMat4> = Vec::new();
     // By how many pixels of the frames their masks are too small, as far as that was tried: who cuts does it alike from frame to frame.
     let mut dilation: Option<f64> = None;
-    let (mut errors, mut searches, mut trusted) = (Vec::new(), 0, true);
-    for (number, path) in frames.iter().enumerate() {
-        let mask = args.mask.as_ref().map(|mask| mask_of(mask, path)).transpose()?;
+    let (mut errors, mut searches, mut trusted, mut count) = (Vec::new(), 0, true, 0);
+    for path in std::iter::once(Ok(first)).chain(frames) {
+        let path = path?;
+        let mask = args.mask.as_ref().map(|mask| mask_of(mask, &path)).transpose()?;
         let mut picture =
-            Picture::open(path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
+            Picture::open(&path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
         let frame_pixels = picture.pixels_on_disk(side);
         picture.dilation = (dilation.unwrap_or(0.0) / frame_pixels).clamp(-WIDEST_RIM, WIDEST_RIM);
-        if let (0, Some(rough)) = (number, &args.rough) {
-            before = vec![rough.read(path, &notation)?];
+        if let (0, Some(rough)) = (count, &args.rough) {
+            before = vec![rough.read(&path, &notation)?];
         }
+        count += 1;
         let run = |options: &Options, starts: Vec<DMat4>| -> Result<Found> {
             let found = args.search.run(options, on, std::slice::from_ref(&picture), &[starts], |_| Ok(()));
             Ok(found?.swap_remove(0))
         };
         let followed = match before[..] {
             [] => None,
-            [last] if dilation.is_none() => Some(run(&first, vec![last])?),
+            [last] if dilation.is_none() => Some(run(&with_mask, vec![last])?),
             [last] => Some(run(&from_frame_to_frame, vec![last])?),
             // It stands still, or goes on as it did.
             [last, earlier, ..] => Some(run(&from_frame_to_frame, vec![last, last * earlier.inverse() * last])?),
@@ -139,7 +144,7 @@ pub fn run(args: &Track) -> Result<bool> {
         if trusted || !searched {
             before.insert(0, found.world_from_camera);
         }
-        let truth = args.truth.as_ref().map(|truth| truth.read(path, &notation)).transpose()?;
+        let truth = args.truth.as_ref().map(|truth| truth.read(&path, &notation)).transpose()?;
         let error = truth.map(|truth| PoseError::of(&found.world_from_camera, &truth));
         errors.extend(error);
         searches += usize::from(searched);
@@ -148,7 +153,7 @@ pub fn run(args: &Track) -> Result<bool> {
         }
         let written = notation.written(&found.world_from_camera);
         let report = FrameReport {
-            frame: path,
+            frame: &path,
             world_from_camera: written.transpose().to_cols_array_2d(),
             loss: found.estimate.loss,
             unexplained: found.unexplained,
@@ -171,19 +176,36 @@ pub fn run(args: &Track) -> Result<bool> {
         let (turn, shift) = (mean(|error| error.rotation_deg), mean(|error| error.translation));
         let worst = errors.iter().map(|error| error.rotation_deg).fold(0.0, f64::max);
         eprintln!(
-            "{} frames, {searches} searched all around; error {turn:.2}° {shift:.3} in the mean, {worst:.2}° at worst",
-            frames.len()
+            "{count} frames, {searches} searched all around; error {turn:.2}° {shift:.3} in the mean, {worst:.2}° at worst"
         );
     }
     Ok(trusted)
 }
 
-/// The pictures in a folder by name, or the frames as they were given.
-fn frames(given: &[PathBuf]) -> Result<Vec<PathBuf>> {
-    let [dir] = given else { return Ok(given.to_vec()) };
-    if !dir.is_dir() {
-        return Ok(given.to_vec());
-    }
+/// Paths of frames, as they come.
+type Frames = Box<dyn Iterator<Item = Result<PathBuf>>>;
+
+/// The pictures in a folder by name, those that stdin names, or the frames as they were given.
+fn frames(given: &[PathBuf]) -> Result<Frames> {
+    let paths = match given {
+        [dash] if dash.as_os_str() == "-" => return Ok(Box::new(paths_on_stdin())),
+        [dir] if dir.is_dir() => pictures_in(dir)?,
+        _ => given.to_vec(),
+    };
+    Ok(Box::new(paths.into_iter().map(Ok)))
+}
+
+/// Blank lines are none.
+fn paths_on_stdin() -> impl Iterator<Item = Result<PathBuf>> {
+    let path = |line: std::io::Result<String>| match line {
+        Ok(line) if line.trim().is_empty() => None,
+        Ok(line) => Some(Ok(line.trim().into())),
+        Err(error) => Some(Err(format!("stdin: {error}").into())),
+    };
+    std::io::stdin().lines().filter_map(path)
+}
+
+fn pictures_in(dir: &Path) -> Result<Vec<PathBuf>> {
     let files = std::fs::read_dir(dir).map_err(|error| format!("{}: {error}", dir.display()))?;
     let mut frames = files.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
     let is_picture = |path: &PathBuf| {
