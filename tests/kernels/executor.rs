@@ -1,6 +1,6 @@
 //! The GPU executor: that its results are a device's, and that what goes wrong there reaches the caller as an error.
 
-use srn_gpu::{Choice, Gpu, GpuExecutor, OpenError, wgpu};
+use srn_gpu::{AdapterInfo, Choice, Gpu, GpuExecutor, OpenError, wgpu};
 use srn_plan::ops::{latent_loss, linear, sum};
 use srn_plan::{BufferId, Builder, Executor, ExecutorError, Plan, Rows, StageId};
 use srn_tests::gpu;
@@ -171,7 +171,18 @@ fn a_choice_needs_no_cache() {
 fn an_unknown_adapter_is_an_error_that_lists_the_known() {
     let Err(OpenError::NotFound { wanted, found }) = Gpu::open(Some("no such adapter")) else { panic!("expected an error") };
     assert_eq!(wanted, "no such adapter");
-    assert!(found.contains(&gpu().adapter().name));
+    assert!(found.contains(&gpu().adapter().to_string()));
+}
+
+#[test]
+fn an_adapter_is_found_by_words_of_its_name_and_its_backend() {
+    let AdapterInfo { name, backend, .. } = gpu().adapter();
+    let of_the_name = name.split_whitespace().next().unwrap();
+    for wanted in [&name, &backend, &format!("{backend} {name}"), &format!("{of_the_name} {backend}").to_uppercase()] {
+        let opened = Gpu::open(Some(wanted)).unwrap().adapter();
+        assert_eq!((&opened.name, &opened.backend), (&name, &backend), "{wanted}");
+    }
+    assert!(Gpu::open(Some(&format!("{name} on another backend"))).is_err());
 }
 
 #[test]

@@ -24,7 +24,7 @@ pub struct EngineArgs {
     /// What computes. `auto`: a GPU if there is one, else the faster of CPU and software adapter.
     #[arg(long, value_enum, default_value_t = Executor::Auto)]
     executor: Executor,
-    /// Name, or part of it, of the graphics adapter; implies `--executor gpu`.
+    /// The graphics adapter, by words of its name or backend (`intel`, `geforce dx12`); implies `--executor gpu`.
     #[arg(long, value_name = "NAME")]
     adapter: Option<String>,
     /// Memory budget, as bytes or with a unit: 512MiB, 2GB. Default: from the adapter, 2 GiB on the CPU.

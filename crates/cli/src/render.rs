@@ -69,7 +69,7 @@ pub struct Render {
     /// Replace instances that exist in the output folder.
     #[arg(long)]
     force: bool,
-    /// Name, or part of it, of the graphics adapter. Default: the fastest kind.
+    /// The graphics adapter, by words of its name or backend (`intel`, `geforce dx12`). Default: the fastest kind.
     #[arg(long)]
     adapter: Option<String>,
 }

@@ -22,6 +22,14 @@ pub struct AdapterInfo {
     pub is_software: bool,
 }
 
+impl AdapterInfo {
+    /// Whether all of `words` are in what is printed of it, in any case.
+    fn has_words(&self, words: &str) -> bool {
+        let printed = self.to_string().to_lowercase();
+        words.to_lowercase().split_whitespace().all(|word| printed.contains(word))
+    }
+}
+
 impl From<wgpu::AdapterInfo> for AdapterInfo {
     fn from(info: wgpu::AdapterInfo) -> Self {
         AdapterInfo {
@@ -45,12 +53,12 @@ pub enum OpenError {
     /// No driver of any backend reports an adapter.
     #[error("no GPU adapter found (on Linux without a GPU, install the package mesa-vulkan-drivers)")]
     NoAdapter,
-    /// Adapters exist, but none has the wanted name.
+    /// Adapters exist, but none is like that.
     #[error("no adapter is called `{wanted}`; found: {}", found.join(", "))]
     NotFound {
-        /// Part of a name that was asked for.
+        /// What was asked for.
         wanted: String,
-        /// Names of the adapters that exist.
+        /// The adapters that exist, as [`AdapterInfo`] prints them.
         found: Vec<String>,
     },
     /// The adapter gave no device.
@@ -140,36 +148,38 @@ pub struct Gpu {
 }
 
 impl Gpu {
-    /// Opens the adapter whose name contains `adapter_name` (in any case), or the first of [`adapters`].
-    pub fn open(adapter_name: Option<&str>) -> Result<Gpu, OpenError> {
-        Self::open_with(adapter_name, false)
+    /// Opens the first of [`adapters`], or the first whose name, backend and driver contain all words of `adapter` (in any case): `intel`,
+    /// say, or `geforce dx12`, since on Windows each GPU is there under Vulkan and under DX12.
+    pub fn open(adapter: Option<&str>) -> Result<Gpu, OpenError> {
+        Self::open_with(adapter, false)
     }
 
     /// The same with cooperative matrices (tensor cores), an experimental feature of wgpu: where a linear layer is fastest so, the factors
     /// of its products are sums of two numbers in `f16`, of 22 digits for the 24 of `f32`, and its sums in `f32`.
-    pub fn open_cooperative(adapter_name: Option<&str>) -> Result<Gpu, OpenError> {
-        Self::open_with(adapter_name, true)
+    pub fn open_cooperative(adapter: Option<&str>) -> Result<Gpu, OpenError> {
+        Self::open_with(adapter, true)
     }
 
-    fn open_with(adapter_name: Option<&str>, with_cooperative: bool) -> Result<Gpu, OpenError> {
+    fn open_with(adapter: Option<&str>, with_cooperative: bool) -> Result<Gpu, OpenError> {
         let mut found = enumerate();
-        let names: Vec<String> = found.iter().map(|adapter| adapter.get_info().name).collect();
-        let chosen = match adapter_name {
-            _ if names.is_empty() => return Err(OpenError::NoAdapter),
+        let infos: Vec<AdapterInfo> = found.iter().map(|adapter| adapter.get_info().into()).collect();
+        let chosen = match adapter {
+            _ if infos.is_empty() => return Err(OpenError::NoAdapter),
             None => 0,
-            Some(wanted) => names
-                .iter()
-                .position(|name| name.to_lowercase().contains(&wanted.to_lowercase()))
-                .ok_or_else(|| OpenError::NotFound { wanted: wanted.into(), found: names.clone() })?,
+            Some(wanted) => infos.iter().position(|info| info.has_words(wanted)).ok_or_else(|| OpenError::NotFound {
+                wanted: wanted.into(),
+                found: infos.iter().map(AdapterInfo::to_string).collect(),
+            })?,
         };
         let adapter = found.swap_remove(chosen);
+        let name = &infos[chosen].name;
         let mut features = adapter.features() & (wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::SUBGROUP);
         let mut experimental_features = wgpu::ExperimentalFeatures::disabled();
         let mut limits = wgpu::Limits::default();
         let mut cooperative = None;
         if with_cooperative {
             let found = find_cooperative(&adapter);
-            cooperative = Some(found.ok_or_else(|| OpenError::NoCooperativeMatrices { adapter: names[chosen].clone() })?);
+            cooperative = Some(found.ok_or_else(|| OpenError::NoCooperativeMatrices { adapter: name.clone() })?);
             features |= COOPERATIVE;
             limits.max_compute_workgroup_storage_size = COOPERATIVE_STORAGE;
             // SAFETY: what is experimental are WGSL's cooperative matrices. Our texts load and store them within the arrays that they
@@ -190,7 +200,7 @@ impl Gpu {
             ..Default::default()
         });
         let (device, queue) = pollster::block_on(request)
-            .map_err(|error| OpenError::Refused { adapter: names[chosen].clone(), what: one_line(&error.to_string()) })?;
+            .map_err(|error| OpenError::Refused { adapter: name.clone(), what: one_line(&error.to_string()) })?;
         let gpu = Gpu { cooperative, ..Gpu::from_device(device, queue) };
         let shared = gpu.shared.clone();
         gpu.device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {

@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use srn_cpu::Precision;
-use srn_gpu::{Gpu, GpuExecutor};
+use srn_gpu::{AdapterInfo, Gpu, GpuExecutor};
 use srn_plan::ops::linear::{self, Layer, Sets};
 use srn_plan::{Builder, Executor, ExecutorError, Plan, PlanError, Rows};
 
@@ -243,8 +243,10 @@ impl std::fmt::Display for Engine {
         match &self.kind {
             Kind::Cpu(Precision::F32) => write!(f, "cpu"),
             Kind::Cpu(Precision::F64) => write!(f, "cpu64"),
-            Kind::Gpu(gpu) if self.is_cooperative() => write!(f, "{}, cooperative matrices", gpu.adapter().name),
-            Kind::Gpu(gpu) => write!(f, "{}", gpu.adapter().name),
+            Kind::Gpu(gpu) => {
+                let AdapterInfo { name, backend, .. } = gpu.adapter();
+                write!(f, "{backend} {name}{}", if self.is_cooperative() { ", cooperative matrices" } else { "" })
+            }
         }
     }
 }
