@@ -8,6 +8,7 @@ use crate::mesh::{Mesh, Part};
 use glam::{Affine3A, Mat3, Vec3};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
 /// LDraw colour codes for parts that leave their main colour open: strong opaque colours that stand out from a white
 /// background and from one another. Names as in `LDConfig.ldr`.
@@ -53,31 +54,59 @@ impl Library {
     pub fn load(&self, part: &Path, main_colour: Option<u32>) -> Result<Mesh> {
         let name = part.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
         let code = main_colour.unwrap_or(MAIN_COLOURS[name_hash(&name) as usize % MAIN_COLOURS.len()].0);
-        let mut mesh = Mesh::default();
         let colour = self.colours.get(&code).copied();
         let colour =
             colour.ok_or_else(|| Error::field(&self.root.join("LDConfig.ldr"), "!COLOUR", format!("code {code}"), "none"))?;
-        self.append(&mut mesh, part, Affine3A::IDENTITY, colour, 0, &mut 0)?;
+        let mut reader = Reader { library: self, mesh: Mesh::default(), placed: 0, known: HashMap::new() };
+        reader.append(&File::read(part.into())?, Affine3A::IDENTITY, colour, 0)?;
+        let mut mesh = reader.mesh;
         mesh.parts = vec![Part { vertices: 0..mesh.vertices.len(), texture: None }];
         mesh.with_faces(part)
     }
 
-    fn append(
-        &self,
-        mesh: &mut Mesh,
-        path: &Path,
-        placed: Affine3A,
-        colour: Pair,
-        depth: usize,
-        files: &mut usize,
-    ) -> Result<()> {
+    fn resolve(&self, code: &str, inherited: Pair) -> Option<Pair> {
+        match code {
+            "16" => Some(inherited),
+            "24" => Some([inherited[1]; 2]),
+            _ => match code.strip_prefix("0x2") {
+                Some(hex) => hex_colour(hex).map(|rgb| [rgb; 2]),
+                None => self.colours.get(&code.parse().ok()?).copied(),
+            },
+        }
+    }
+}
+
+/// A file as it was read.
+struct File {
+    path: PathBuf,
+    text: String,
+}
+
+impl File {
+    fn read(path: PathBuf) -> Result<Self> {
+        let text = String::from_utf8_lossy(&read_bytes(&path)?).into_owned();
+        Ok(File { path, text })
+    }
+}
+
+/// A part while it is read.
+struct Reader<'a> {
+    library: &'a Library,
+    mesh: Mesh,
+    /// Sub-files placed so far.
+    placed: usize,
+    /// Those read so far, by name: the same stud is placed a hundred times.
+    known: HashMap<String, Rc<File>>,
+}
+
+impl Reader<'_> {
+    fn append(&mut self, File { path, text }: &File, placed: Affine3A, colour: Pair, depth: usize) -> Result<()> {
         // Files that hold each other twice, and so on, would take for ever.
-        *files += 1;
-        if *files > MOST_FILES {
+        self.placed += 1;
+        if self.placed > MOST_FILES {
             return Err(Error::field(path, "sub-files", format!("at most {MOST_FILES}"), "more"));
         }
-        mesh.check_size(path)?;
-        let text = String::from_utf8_lossy(&read_bytes(path)?).into_owned();
+        self.mesh.check_size(path)?;
         for (number, line) in text.lines().enumerate() {
             let words: Vec<_> = line.split_whitespace().collect();
             let bad = |expected| Error::field(path, format!("line {}", number + 1), expected, format!("\"{line}\""));
@@ -90,45 +119,45 @@ impl Library {
             if !["1", "3", "4"].contains(&kind) {
                 continue;
             }
-            let own = self.resolve(words.get(1).copied().unwrap_or_default(), colour).ok_or_else(|| bad("a known colour"))?;
+            let code = words.get(1).copied().unwrap_or_default();
+            let own = self.library.resolve(code, colour).ok_or_else(|| bad("a known colour"))?;
             if kind == "1" {
                 let m = floats(12)?;
                 let rows = Mat3::from_cols_slice(&m[3..]).transpose();
                 let here = Affine3A::from_mat3_translation(rows, Vec3::from_slice(&m));
                 let name = words.get(14..).ok_or_else(|| bad("a file name"))?.join(" ").to_lowercase().replace('\\', "/");
-                let candidates = ["parts", "p"].map(|folder| self.root.join(folder).join(&name));
-                let file = candidates.into_iter().find(|file| file.is_file());
-                let file = file.ok_or_else(|| Error::Missing {
-                    path: self.root.join("parts").join(&name),
-                    why: format!("{} needs it", path.display()),
-                })?;
                 // No part nests deeper than about ten files; a file that contains itself would nest for ever.
                 if depth > 50 {
                     return Err(bad("at most 50 nested files"));
                 }
-                self.append(mesh, &file, placed * here, own, depth + 1, files)?;
+                let file = self.sub_file(name, path)?;
+                self.append(&file, placed * here, own, depth + 1)?;
             } else {
                 let n = if kind == "3" { 3 } else { 4 };
                 let values = floats(3 * n)?;
                 let corner = |i: usize| placed.transform_point3(Vec3::from_slice(&values[3 * i..]));
-                mesh.push_flat([0, 1, 2].map(corner), own[0]);
+                self.mesh.push_flat([0, 1, 2].map(corner), own[0]);
                 if n == 4 {
-                    mesh.push_flat([0, 2, 3].map(corner), own[0]);
+                    self.mesh.push_flat([0, 2, 3].map(corner), own[0]);
                 }
             }
         }
         Ok(())
     }
 
-    fn resolve(&self, code: &str, inherited: Pair) -> Option<Pair> {
-        match code {
-            "16" => Some(inherited),
-            "24" => Some([inherited[1]; 2]),
-            _ => match code.strip_prefix("0x2") {
-                Some(hex) => hex_colour(hex).map(|rgb| [rgb; 2]),
-                None => self.colours.get(&code.parse().ok()?).copied(),
-            },
+    /// The sub-file of this name, which the file `above` places.
+    fn sub_file(&mut self, name: String, above: &Path) -> Result<Rc<File>> {
+        if let Some(file) = self.known.get(&name) {
+            return Ok(file.clone());
         }
+        let candidates = ["parts", "p"].map(|folder| self.library.root.join(folder).join(&name));
+        let path = candidates.into_iter().find(|path| path.is_file()).ok_or_else(|| Error::Missing {
+            path: self.library.root.join("parts").join(&name),
+            why: format!("{} needs it", above.display()),
+        })?;
+        let file = Rc::new(File::read(path)?);
+        self.known.insert(name, file.clone());
+        Ok(file)
     }
 }
 
