@@ -1,5 +1,6 @@
 //! Every WGSL text of the table is valid and is what the table says: parameters, bindings, access, entry point, opening lines.
 
+use naga::back::{hlsl, msl};
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{AddressSpace, GlobalVariable, Module, ScalarKind, ShaderStage, StorageAccess, TypeInner};
 use srn_shaders::{Binding, COMMON, Cooperative, Element, Kernel, Requirement, Scalar, TABLE, Variant};
@@ -11,7 +12,7 @@ fn modules() -> impl Iterator<Item = (String, &'static Kernel, &'static Variant,
     TABLE.iter().flat_map(|kernel| {
         kernel.variants.iter().map(move |variant| {
             let label = format!("{}/{}.wgsl", kernel.op, variant.name);
-            let source = source(kernel, variant);
+            let source = source(kernel, variant, 16);
             let module = naga::front::wgsl::parse_str(&source)
                 .unwrap_or_else(|error| panic!("{label}: {}", error.emit_to_string(&source)));
             (label, *kernel, variant, module)
@@ -19,10 +20,10 @@ fn modules() -> impl Iterator<Item = (String, &'static Kernel, &'static Variant,
     })
 }
 
-/// The whole text, for matrices and subgroups of the sizes that most GPUs have.
-fn source(kernel: &Kernel, variant: &Variant) -> String {
+/// The whole text, for cooperative matrices of `side` × `side` (most GPUs have 16 × 16) and subgroups of 32.
+fn source(kernel: &Kernel, variant: &Variant, side: u32) -> String {
     let cooperative = variant.requires.contains(&Requirement::CooperativeMatrices);
-    let head = cooperative.then(|| Cooperative { side: 16, lanes: 32 }.head());
+    let head = cooperative.then(|| Cooperative { side, lanes: 32 }.head());
     head.unwrap_or_default() + &kernel.source(variant)
 }
 
@@ -43,8 +44,33 @@ fn every_kernel_validates() {
         });
         let capabilities = capabilities.fold(Capabilities::empty(), |all, one| all | one);
         if let Err(error) = Validator::new(ValidationFlags::all(), Capabilities::default() | capabilities).validate(&module) {
-            panic!("{label}: {}", error.emit_to_string(&source(kernel, variant)));
+            panic!("{label}: {}", error.emit_to_string(&source(kernel, variant, 16)));
         }
+    }
+}
+
+/// On Vulkan they run, in all other tests; here at least the shader texts are written that drivers of other systems get.
+#[test]
+fn every_kernel_can_be_written_for_metal_and_dx12() {
+    for (label, kernel, variant, _) in modules() {
+        // Those of Metal.
+        let module = naga::front::wgsl::parse_str(&source(kernel, variant, 8)).unwrap();
+        let info = Validator::new(ValidationFlags::all(), Capabilities::all()).validate(&module).unwrap();
+
+        let metal = msl::Options { lang_version: (2, 4), fake_missing_bindings: true, ..Default::default() };
+        let written = msl::write_string(&module, &info, &metal, &Default::default());
+        assert!(written.is_ok(), "{label}: {:?}", written.err());
+
+        // Direct3D has none in compute shaders; without dxcompiler.dll it has shader model 5.1, and no subgroups.
+        let shader_model = match variant.requires {
+            needs if needs.contains(&Requirement::CooperativeMatrices) => continue,
+            needs if needs.contains(&Requirement::Subgroups) => hlsl::ShaderModel::V6_0,
+            _ => hlsl::ShaderModel::V5_1,
+        };
+        let dx12 = hlsl::Options { shader_model, fake_missing_bindings: true, ..Default::default() };
+        let (mut text, pipeline) = (String::new(), hlsl::PipelineOptions::default());
+        let written = hlsl::Writer::new(&mut text, &dx12, &pipeline).write(&module, &info, None).map(|_| ());
+        assert!(written.is_ok(), "{label}: {:?}", written.err());
     }
 }
 

@@ -438,12 +438,13 @@ mod tests {
         ];
         for (file, spoil, expected) in cases {
             let dir = set(&["a", "b"]);
+            let in_folder = dir.path().join("b").display().to_string();
             spoil(&dir.path().join("b").join(file));
             match read(dir.path(), Format::Srn, &ReadOptions::default()) {
                 Ok(captures) => {
                     let report = inspect(&captures, Axes::OpenCv, Origin::Given);
                     let found = report.problems.iter().find(|problem| problem.contains(expected));
-                    let named = found.is_some_and(|problem| problem.contains("/b") || problem.starts_with("b:"));
+                    let named = found.is_some_and(|problem| problem.contains(&in_folder) || problem.starts_with("b:"));
                     assert!(named, "{expected}: {:?}", report.problems);
                     contact_sheet(&captures, 2, 2);
                 }

@@ -141,15 +141,16 @@ mod tests {
 
     #[test]
     fn links_are_refused_where_they_are_wanted() {
+        let link = Path::new("a").join("link").display().to_string();
         for kind in [EntryType::Symlink, EntryType::Link, EntryType::Char] {
             let archive = tarred(&["a/good"], Some((kind, "a/link")));
             let error = unpack(|keep| tar(&archive[..], &|_| true, keep)).unwrap_err().to_string();
-            assert!(error.contains("a/link"), "{error}");
+            assert!(error.contains(&link), "{error}");
             let found = unpack(|keep| tar(&archive[..], &|path| path == Path::new("a/good"), keep)).unwrap();
             assert_eq!(found.len(), 1, "{kind:?}");
         }
         let error = unpack(|keep| zip(zipped(&["a/good"], Some("a/link")), &|_| true, keep)).unwrap_err().to_string();
-        assert!(error.contains("a/link"), "{error}");
+        assert!(error.contains(&link), "{error}");
     }
 
     #[test]
