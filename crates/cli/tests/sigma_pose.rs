@@ -182,6 +182,12 @@ fn a_calibrated_model_states_deviations() {
     assert!(run(dir, evaluate, 0).contains("ellipsoid of 1 of 1"));
 }
 
+fn frames_of(animation: &Path) -> usize {
+    let file = BufReader::new(fs::File::open(animation).unwrap());
+    let frames = image::AnimationDecoder::into_frames(image::codecs::gif::GifDecoder::new(file).unwrap());
+    frames.map(Result::unwrap).count()
+}
+
 /// A line per frame; what is lost is searched for again; an animation is written once.
 #[test]
 fn frames_are_followed() {
@@ -193,9 +199,7 @@ fn frames_are_followed() {
     assert_eq!(lines.len(), 20);
     assert!(lines.iter().all(|line| line["searched"] == false && line["trusted"] == true && line["error"].is_object()));
     assert!(lines[3]["frame"].as_str().unwrap().ends_with("000003.png"));
-    let animation = BufReader::new(fs::File::open(dir.join("frames.gif")).unwrap());
-    let animation = image::AnimationDecoder::into_frames(image::codecs::gif::GifDecoder::new(animation).unwrap());
-    assert_eq!(animation.count(), 20);
+    assert_eq!(frames_of(&dir.join("frames.gif")), 20);
     fail(dir, &format!("{frames} --record frames.gif"), &["frames.gif", "--force"]);
     fail(dir, "track . --model model.safetensors --instance seat --fov 50", &["no pictures"]);
 
@@ -205,11 +209,11 @@ fn frames_are_followed() {
     assert_eq!((lines.matches("searched all around").count(), lines.matches("DO NOT TRUST").count()), (2, 2), "{lines}");
 }
 
-/// Who writes frames as they come gets an answer to each before the next one is there.
+/// Who writes frames as they come gets an answer to each before the next one is there, and keeps them when one is not.
 #[test]
 fn frames_come_on_stdin() {
     let home = home();
-    let args = "track - --model model.safetensors --executor cpu --steps 1 --rough auto --accept 1e9 --json";
+    let args = "track - --model model.safetensors --executor cpu --steps 1 --rough auto --accept 1e9 --json --record frames.gif";
     let mut command = Command::new(env!("CARGO_BIN_EXE_sigma-pose"));
     command.current_dir(home.path()).args(args.split(' ')).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut tracking = command.spawn().unwrap();
@@ -226,8 +230,10 @@ fn frames_come_on_stdin() {
     let ended = tracking.wait_with_output().unwrap();
     assert!(poses.next().is_none() && String::from_utf8_lossy(&ended.stderr).contains("no-such.png"));
     assert_eq!(ended.status.code(), Some(2));
-    // Nothing comes.
-    fail(home.path(), args, &["stdin", "no frame"]);
+    assert_eq!(frames_of(&home.path().join("frames.gif")), 2);
+    // Nothing comes, and nothing is overwritten by it.
+    fail(home.path(), &format!("{args} --force"), &["stdin", "no frame"]);
+    assert_eq!(frames_of(&home.path().join("frames.gif")), 2);
 }
 
 /// The tables of one instance: every preset and loss, all files, nothing overwritten.

@@ -1,5 +1,7 @@
 //! What `sigma-pose` reads and writes: pictures with their cameras, PNG and GIF.
 
+use std::fs::File;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -209,16 +211,44 @@ pub fn write_png(path: &Path, picture: &RgbImage) -> Result<()> {
     Ok(write_atomically(path, bytes.get_ref())?)
 }
 
-/// Writes an endless animation; each frame with the seconds that it stays.
+/// Writes an endless animation, whole or not at all; each frame with the seconds that it stays.
 pub fn write_gif(path: &Path, frames: impl IntoIterator<Item = (RgbImage, f64)>) -> Result<()> {
     let mut bytes = Vec::new();
-    let mut encoder = GifEncoder::new_with_speed(&mut bytes, 10);
-    encoder.set_repeat(Repeat::Infinite)?;
+    let mut encoder = endless(&mut bytes)?;
     for (picture, seconds) in frames {
-        let rgba = image::DynamicImage::from(picture).into_rgba8();
-        let delay = Delay::from_numer_denom_ms((1000.0 * seconds) as u32, 1);
-        encoder.encode_frame(Frame::from_parts(rgba, 0, 0, delay))?;
+        encoder.encode_frame(shown(picture, seconds))?;
     }
     drop(encoder);
     Ok(write_atomically(path, &bytes)?)
+}
+
+/// An endless animation that is in its file as far as it has come, however the program ends.
+pub struct Animation {
+    path: PathBuf,
+    encoder: GifEncoder<File>,
+}
+
+impl Animation {
+    /// An empty file.
+    pub fn create(path: &Path) -> Result<Self> {
+        let file = File::create(path).map_err(|error| format!("{}: {error}", path.display()))?;
+        Ok(Animation { path: path.into(), encoder: endless(file)? })
+    }
+
+    /// One frame more, which stays for so many seconds.
+    pub fn push(&mut self, picture: RgbImage, seconds: f64) -> Result<()> {
+        let written = self.encoder.encode_frame(shown(picture, seconds));
+        written.map_err(|error| format!("{}: {error}", self.path.display()).into())
+    }
+}
+
+fn endless<W: Write>(out: W) -> Result<GifEncoder<W>> {
+    let mut encoder = GifEncoder::new_with_speed(out, 10);
+    encoder.set_repeat(Repeat::Infinite)?;
+    Ok(encoder)
+}
+
+fn shown(picture: RgbImage, seconds: f64) -> Frame {
+    let delay = Delay::from_numer_denom_ms((1000.0 * seconds) as u32, 1);
+    Frame::from_parts(image::DynamicImage::from(picture).into_rgba8(), 0, 0, delay)
 }

@@ -8,7 +8,7 @@ use serde::Serialize;
 use sigma_srn::{Doubt, Options, Phase, Pose6};
 
 use super::draw;
-use super::files::{ObjectArgs, Picture, PoseSource, mask_of, model_side, write_gif};
+use super::files::{Animation, ObjectArgs, Picture, PoseSource, mask_of, model_side};
 use super::notation::NotationArgs;
 use super::search::{Confidence, Found, On, PoseError, SearchArgs, Starts};
 use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
@@ -42,7 +42,7 @@ pub struct Track {
     /// Print a line of JSON per frame.
     #[arg(long)]
     json: bool,
-    /// Write an animation: each frame beside the view from its pose.
+    /// Write an animation as it grows: each frame beside the view from its pose.
     #[arg(long, value_name = "GIF")]
     record: Option<PathBuf>,
     /// Overwrite the file of --record.
@@ -97,7 +97,7 @@ pub fn run(args: &Track) -> Result<bool> {
     let with = |phases: &[Phase]| Options { phases: phases.to_vec(), min_starts: 0, ..all_around.clone() };
     let (with_mask, from_frame_to_frame) = (with(&phases), with(&[phases[0], phases[2]]));
 
-    let mut animation = Vec::new();
+    let mut animation = None;
     // The last two poses, the later one first.
     let mut before: Vec<DMat4> = Vec::new();
     // By how many pixels of the frames their masks are too small, as far as that was tried: who cuts does it alike from frame to frame.
@@ -148,8 +148,12 @@ pub fn run(args: &Track) -> Result<bool> {
         let error = truth.map(|truth| PoseError::of(&found.world_from_camera, &truth));
         errors.extend(error);
         searches += usize::from(searched);
-        if args.record.is_some() {
-            animation.push(side_by_side(&picture, &found, side));
+        if let Some(path) = &args.record {
+            let animation = match &mut animation {
+                Some(animation) => animation,
+                none => none.insert(Animation::create(path)?),
+            };
+            animation.push(side_by_side(&picture, &found, side), STAY)?;
         }
         let written = notation.written(&found.world_from_camera);
         let report = FrameReport {
@@ -168,7 +172,6 @@ pub fn run(args: &Track) -> Result<bool> {
         print(&if args.json { serde_json::to_string(&report)? } else { report.line(&Pose6::from_matrix(&written)) })?;
     }
     if let Some(path) = &args.record {
-        write_gif(path, animation.into_iter().map(|frame| (frame, STAY)))?;
         eprintln!("{}", path.display());
     }
     if !errors.is_empty() {
