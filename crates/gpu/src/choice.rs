@@ -13,7 +13,7 @@ use crate::Gpu;
 use crate::executor::Launch;
 use crate::gpu::lock;
 
-/// Where choices are kept: a line for each, a hash and `op/variant`.
+/// Where choices are kept: a line for each, a hash and `op/variant`, or what else was found of a device.
 const FILE: &str = "variants.txt";
 
 /// How the variants of kernels are chosen.
@@ -60,6 +60,30 @@ impl Chooser {
         Chooser { choice, chosen: Mutex::default() }
     }
 
+    pub fn choice(&self) -> &Choice {
+        &self.choice
+    }
+
+    /// What is kept under a key.
+    pub fn remembered(&self, key: &str) -> Option<String> {
+        read(self.folder()?).ok()?.remove(key)
+    }
+
+    /// Keeps a word, if there is a folder.
+    pub fn remember(&self, key: &str, word: &str) {
+        let Some(folder) = self.folder() else { return };
+        if let Err(error) = keep(folder, key, word) {
+            tracing::debug!(%error, ?folder, "the choice cannot be kept");
+        }
+    }
+
+    fn folder(&self) -> Option<&Path> {
+        match &self.choice {
+            Choice::Measured { cache } => cache.as_deref(),
+            Choice::Named(_) => None,
+        }
+    }
+
     /// The same choice with nothing chosen yet: for other texts.
     pub fn afresh(&self) -> Self {
         Chooser::new(self.choice.clone())
@@ -83,11 +107,11 @@ impl Chooser {
         let variant = match &self.choice {
             _ if usable.len() == 1 => usable[0],
             Choice::Named(name) => usable.iter().find(|variant| variant.name.ends_with(name)).unwrap_or(&usable[0]),
-            Choice::Measured { cache: None } => measure(gpu, step, &usable, launch)?,
-            Choice::Measured { cache: Some(folder) } => {
-                let key = key(gpu, step, &shape, &usable);
+            Choice::Measured { .. } => {
+                let texts: Vec<String> = usable.iter().map(|variant| gpu.source(step.kernel, variant)).collect();
+                let key = key(&format!("{} {shape:?} {texts:?}", gpu.adapter()));
                 let kept = || {
-                    let label = read(folder).ok()?.remove(&key)?;
+                    let label = self.remembered(&key)?;
                     usable.iter().copied().find(|variant| step.kernel.label(variant) == label)
                 };
                 match kept() {
@@ -96,9 +120,7 @@ impl Chooser {
                         let fastest = measure(gpu, step, &usable, launch)?;
                         // What another process has chosen meanwhile holds for both.
                         kept().unwrap_or_else(|| {
-                            if let Err(error) = keep(folder, &key, step.kernel.label(fastest)) {
-                                tracing::debug!(%error, ?folder, "the choice cannot be kept");
-                            }
+                            self.remember(&key, &step.kernel.label(fastest));
                             fastest
                         })
                     }
@@ -126,15 +148,10 @@ fn widths(step: &Step) -> impl Iterator<Item = u32> {
     fields.map(|&(_, _, offset)| bytemuck::pod_read_unaligned(&step.params[offset..offset + 4]))
 }
 
-/// What a measurement holds for: the device, the shape and the texts.
-fn key(gpu: &Gpu, step: &Step, shape: &Shape, usable: &[&Variant]) -> String {
-    let texts: Vec<String> = usable.iter().map(|variant| gpu.source(step.kernel, variant)).collect();
-    format!("{:016x}", fnv(format!("{} {shape:?} {texts:?}", gpu.adapter()).as_bytes()))
-}
-
-/// Fowler, Noll and Vo's hash 1a: the standard library's may change with its version.
-fn fnv(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3))
+/// What a line of the file holds for, device and texts among it: Fowler, Noll and Vo's hash 1a, since the standard library's may change with its version.
+pub(crate) fn key(of: &str) -> String {
+    let hash = of.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3));
+    format!("{hash:016x}")
 }
 
 /// Work that a software adapter is timed on, in floating-point operations: a millisecond or a few, which other programs
@@ -211,7 +228,7 @@ fn measure(
     Ok(fastest)
 }
 
-/// The labels `op/variant` by their keys; lines that are none are left out.
+/// The words, `op/variant` and others, by their keys; lines that are none are left out.
 fn read(folder: &Path) -> io::Result<BTreeMap<String, String>> {
     let text = fs::read_to_string(folder.join(FILE))?;
     let lines = text.lines().filter_map(|line| line.split_once(' '));
@@ -219,9 +236,9 @@ fn read(folder: &Path) -> io::Result<BTreeMap<String, String>> {
 }
 
 /// Adds a line to the file, which is written whole or not at all: another process may be reading.
-fn keep(folder: &Path, key: &str, label: String) -> io::Result<()> {
+fn keep(folder: &Path, key: &str, word: &str) -> io::Result<()> {
     let mut known = read(folder).unwrap_or_default();
-    known.insert(key.to_owned(), label);
+    known.insert(key.to_owned(), word.to_owned());
     let lines: String = known.iter().map(|(key, label)| format!("{key} {label}\n")).collect();
     let nanoseconds = SystemTime::UNIX_EPOCH.elapsed().map_or(0, |time| time.as_nanos());
     let new = folder.join(format!("{FILE}.{}.{nanoseconds}", std::process::id()));

@@ -4,9 +4,9 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 
 use srn_plan::{ExecutorError, Kernel};
-use srn_shaders::{Cooperative, Requirement, Variant};
+use srn_shaders::{Cooperative, Requirement, TABLE, Variant};
 
-use crate::choice::{Choice, Chooser};
+use crate::choice::{Choice, Chooser, key};
 use crate::pipeline::Pipeline;
 
 /// An adapter of this machine.
@@ -246,6 +246,28 @@ impl Gpu {
     /// The same device, with the variants of kernels chosen in this way.
     pub fn with_choice(&self, choice: Choice) -> Gpu {
         Gpu { chooser: Arc::new(Chooser::new(choice)), ..self.clone() }
+    }
+
+    /// How variants are chosen.
+    pub fn choice(&self) -> &Choice {
+        self.chooser.choice()
+    }
+
+    /// What [`Gpu::remember`] was told last under this name of a device with this name, driver and kernels' texts, in this process or another;
+    /// `None` where nothing is kept.
+    pub fn remembered(&self, name: &str) -> Option<String> {
+        self.chooser.remembered(&self.key(name))
+    }
+
+    /// Keeps a word about this device where choices of variants are kept.
+    pub fn remember(&self, name: &str, word: &str) {
+        self.chooser.remember(&self.key(name), word);
+    }
+
+    /// What a word about the whole device is kept under.
+    fn key(&self, name: &str) -> String {
+        let texts = TABLE.iter().flat_map(|kernel| kernel.variants.iter().map(|variant| self.source(kernel, variant)));
+        key(&format!("{} {name} {:?}", self.adapter(), texts.collect::<Vec<_>>()))
     }
 
     pub(crate) fn chooser(&self) -> &Chooser {

@@ -67,6 +67,19 @@ pub enum Error {
         /// The training step.
         step: u64,
     },
+    /// A GPU whose results are wrong.
+    #[error(
+        "adapter `{adapter}` computes wrong results: gradients of {work} differ by {difference:.1e} of the largest from those of the CPU \
+         executor, also with the plain form of every kernel; try another driver, another adapter, or the CPU executor"
+    )]
+    Adapter {
+        /// The adapter, with backend and driver.
+        adapter: String,
+        /// What was tried.
+        work: &'static str,
+        /// Relative to the largest; infinite where something was not finite.
+        difference: f64,
+    },
     /// A mistake in a plan: a bug here, or a model with shapes that do not fit.
     #[error(transparent)]
     Plan(#[from] PlanError),

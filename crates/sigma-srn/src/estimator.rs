@@ -19,8 +19,10 @@ use crate::{Error, Rays, pixel_grid};
 /// How far starts are turned that the search adds. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
 const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
 
-/// Hypotheses that cooperative matrices are tried on.
+/// Hypotheses that a GPU, and cooperative matrices, are tried on.
 const TRIED: usize = 8;
+/// Most rays to a side of the pictures that a GPU is tried on.
+const PROOF_SIDE: u32 = 16;
 
 /// An image whose camera pose is wanted.
 #[derive(Clone, Debug)]
@@ -236,6 +238,8 @@ struct Hypothesis {
 
 /// Estimates the poses of all queries in one batch. `observe` is called after every evaluation: before each step, and at the end
 /// of each phase.
+///
+/// A GPU that has looked for no poses before is compared with the CPU executor first, and refused where gradients are wrong ([`Error::Adapter`]).
 pub fn estimate(
     engine: &Engine,
     model: &Model,
@@ -264,12 +268,24 @@ pub fn estimate(
         let starts: Vec<DMat4> = q.starts.iter().copied().chain(around.into_iter().flatten()).collect();
         hypotheses.extend(starts.iter().enumerate().map(new));
     }
-    engine.check_cooperative(|engine| {
-        let tried = &hypotheses[..hypotheses.len().min(TRIED)];
-        let (mut descent, _) = prepare(engine, model, queries, options, &options.phases[0], tried)?;
+    let gradients_of = |engine: &Engine, tried: &[Hypothesis], stride: u32| {
+        let phase = Phase { stride, ..options.phases[0] };
+        let (mut descent, _) = prepare(engine, model, queries, options, &phase, tried)?;
         descent.evaluate()?;
         descent.gradients()
+    };
+    engine.prove("poses", |engine| {
+        // As many of them from one start alone, and no more rays of each than a look casts: the CPU has to do the same.
+        let around = |h: &Hypothesis| {
+            let at = |matrix: DMat4| Hypothesis { pose: Pose6::from_matrix(&matrix), ..*h };
+            turned(&h.pose.to_matrix()).map(at).collect::<Vec<_>>()
+        };
+        let tried: Vec<Hypothesis> = hypotheses.iter().copied().chain(hypotheses.iter().flat_map(around)).take(TRIED).collect();
+        let stride = if is_gmsd(options.method) { 1 } else { queries[0].width.max(queries[0].height).div_ceil(PROOF_SIDE) };
+        Ok(gradients_of(engine, &tried, stride)?.iter().map(|six| vec![six.to_vec()]).collect())
     })?;
+    engine
+        .check_cooperative(|engine| gradients_of(engine, &hypotheses[..hypotheses.len().min(TRIED)], options.phases[0].stride))?;
 
     for (number, phase) in options.phases.iter().enumerate() {
         let mut running: Vec<Hypothesis> = Vec::new();
@@ -368,6 +384,10 @@ pub fn estimate(
         estimates.push(Estimate { pose, loss, curvature, light, dilation, target, extent, ranking });
     }
     Ok(estimates)
+}
+
+fn is_gmsd(method: Method) -> bool {
+    matches!(method, Method::Adam { loss: Loss::Gmsd, .. })
 }
 
 /// A camera turned about the object by 40°, to either side about each of its axes.
@@ -560,7 +580,7 @@ fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Erro
         if phase.stride == 0 || phase.keep == 0 {
             return setting("phases", "stride and keep must be at least 1");
         }
-        if matches!(options.method, Method::Adam { loss: Loss::Gmsd, .. }) && phase.stride != 1 {
+        if is_gmsd(options.method) && phase.stride != 1 {
             return setting("loss", "GMSD compares neighbouring pixels: it needs stride 1 in every phase");
         }
     }

@@ -4,16 +4,19 @@ use std::borrow::Cow;
 use std::collections::HashMap;
 use std::path::Path;
 
+use rand::RngExt;
 use srn_plan::ops::{adam, depth, depth_loss, image_loss, latent_loss, tile as tile_ops};
 use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, Tile, tiles};
 
+use crate::camera::{Intrinsics, fixed24};
 use crate::engine::{Engine, Runner};
 use crate::model::{Model, Tensors, read_tensors, write_tensors};
 use crate::network::backward::{self, HyperScratch};
 use crate::network::streamed::{OnHost, Streamed};
 use crate::network::{Batch, HyperSaved, Network, Purpose, Saved, Scratch, SourceBuffers, Started, Sums, Trainable, forward};
+use crate::random::stream;
 use crate::rays::wanted;
-use crate::{Error, Rays};
+use crate::{Error, Rays, pixel_grid};
 
 /// Weight of the image term.
 const IMAGE_WEIGHT: f64 = 200.0;
@@ -21,6 +24,11 @@ const IMAGE_WEIGHT: f64 = 200.0;
 const LATENT_WEIGHT: f64 = 1.0;
 /// Weight of the depth term: 1e-3 of the regulariser's 1e4.
 const DEPTH_WEIGHT: f64 = 10.0;
+
+/// Images that a GPU is tried on, one at a time, their side in pixels, and most numbers of a tensor that are looked at.
+const PROOFS: u32 = 3;
+const PROOF_SIDE: u32 = 16;
+const PROOF_VALUES: usize = 4096;
 
 /// What is trained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,6 +48,20 @@ pub struct TrainingBatch {
     pub rays: Rays,
     /// Colours in [-1, 1], `[images, rays, 3]`.
     pub target_rgb: Vec<f32>,
+}
+
+impl TrainingBatch {
+    /// One image of pixels of any colours: another camera, as far away as the model was trained from, and another instance for each `number`.
+    fn noise(model: &Model, number: u32) -> Self {
+        let mut random = stream(0, number.into());
+        let mut rays = Rays::default();
+        let side = f64::from(PROOF_SIDE);
+        let intrinsics = Intrinsics { fx: side, fy: side, cx: side / 2.0, cy: side / 2.0, pixel_center: 0.5 };
+        let camera = fixed24(model.metadata.orbit_radius.unwrap_or(1.3))[7 * number as usize];
+        rays.push(&camera, &intrinsics, pixel_grid(PROOF_SIDE, PROOF_SIDE, 1), &mut random);
+        let target_rgb = (0..3 * rays.z0.len()).map(|_| random.random_range(-1.0..1.0)).collect();
+        TrainingBatch { instances: vec![number % model.layout.instances], rays, target_rgb }
+    }
 }
 
 /// Terms of the loss, without their weights.
@@ -96,14 +118,33 @@ impl Trainer {
     ///
     /// Where the parameters with their gradients and moments would take more than half of the engine's memory budget, the large layers of
     /// the hypernetwork stay on the host, and the device has a part of one at a time.
+    ///
+    /// A GPU that has not trained before is compared with the CPU executor first, and refused where gradients are wrong ([`Error::Adapter`]).
     pub fn new(engine: &Engine, model: Model, train: Train, images: u32, rays: u32) -> Result<Self, Error> {
-        let batch = Batch { images, rays, slots: images };
         for (field, value) in [("batch", images), ("rays", rays)] {
             if value == 0 {
                 return Err(Error::Setting { field, what: "must be at least 1".into() });
             }
         }
         model.hypernetwork()?;
+        let work = if train == Train::Codes { "codes" } else { "all parameters" };
+        engine.prove(work, |engine| {
+            let mut trainer = Self::unproven(engine, model.clone(), train, 1, PROOF_SIDE * PROOF_SIDE)?;
+            let few = |(_, values): (String, Vec<f32>)| {
+                let every = values.len().div_ceil(PROOF_VALUES).max(1);
+                values.into_iter().step_by(every).map(f64::from).collect()
+            };
+            let mut gradients = |number| {
+                trainer.gradients(&TrainingBatch::noise(&model, number))?;
+                Ok(trainer.read_gradients()?.into_iter().map(few).collect())
+            };
+            (0..PROOFS).map(&mut gradients).collect()
+        })?;
+        Self::unproven(engine, model, train, images, rays)
+    }
+
+    fn unproven(engine: &Engine, model: Model, train: Train, images: u32, rays: u32) -> Result<Self, Error> {
+        let batch = Batch { images, rays, slots: images };
         let features = model.layout.features();
         // Value, gradient and two moments.
         let on_host = OnHost::of(engine, &model, if train == Train::Everything { 4 } else { 1 });

@@ -1,7 +1,6 @@
 //! Where plans run: a GPU through wgpu, or the CPU.
 
-use std::iter::zip;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
 use srn_cpu::Precision;
@@ -10,6 +9,9 @@ use srn_plan::ops::linear::{self, Layer, Sets};
 use srn_plan::{Builder, Executor, ExecutorError, Plan, PlanError, Rows};
 
 use crate::Error;
+use proof::{Proofs, difference};
+
+mod proof;
 
 /// Memory that a plan may take on the CPU where the user sets no budget, in bytes.
 const CPU_BUDGET: u64 = 2 << 30;
@@ -40,12 +42,14 @@ pub struct Engine {
     tile_rows: Option<u32>,
     /// Where cooperative matrices are wanted: the difference that they were found to make, see [`Engine::cooperative_difference`].
     cooperative: Option<Arc<OnceLock<f64>>>,
+    proofs: Arc<Mutex<Proofs>>,
 }
 
 impl Engine {
     /// The CPU in `f32`, with all threads of the current rayon pool.
     pub fn cpu() -> Self {
-        Engine { kind: Kind::Cpu(Precision::F32), budget: CPU_BUDGET, tile_rows: None, cooperative: None }
+        let kind = Kind::Cpu(Precision::F32);
+        Engine { kind, budget: CPU_BUDGET, tile_rows: None, cooperative: None, proofs: Arc::default() }
     }
 
     /// The CPU in `f64`: the oracle of the tests.
@@ -60,7 +64,7 @@ impl Engine {
     pub fn gpu(gpu: Gpu) -> Self {
         let budget = gpu.default_memory_budget();
         let cooperative = gpu.cooperative().map(|_| Arc::default());
-        Engine { kind: Kind::Gpu(gpu), budget, tile_rows: None, cooperative }
+        Engine { kind: Kind::Gpu(gpu), budget, tile_rows: None, cooperative, proofs: Arc::default() }
     }
 
     /// The GPU where there is an adapter that is not a software one, else whichever executor is faster on a small matrix
@@ -113,13 +117,8 @@ impl Engine {
         let Some(known) = self.cooperative.as_ref().filter(|known| known.get().is_none()) else { return Ok(()) };
         let found = |difference: f64| Engine { cooperative: Some(Arc::new(difference.into())), ..self.clone() };
         let (without, with) = (gradients(&found(f64::INFINITY))?.concat(), gradients(&found(0.0))?.concat());
-        let largest = without.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
-        let difference = zip(&without, &with).fold(0.0, |worst: f64, (a, b)| worst.max((a - b).abs()));
-        // Maxima pass over what is not a number.
-        let is_finite = without.iter().chain(&with).all(|value| value.is_finite());
-        let difference = if is_finite { difference / largest.max(f64::MIN_POSITIVE) } else { f64::INFINITY };
         // Another thread may have been first, with the same outcome.
-        known.get_or_init(|| difference);
+        known.get_or_init(|| difference(&[with], &[without]));
         Ok(())
     }
 
@@ -201,14 +200,20 @@ impl Engine {
     pub(crate) fn prepare(&self, plan: Plan) -> Result<Runner, ExecutorError> {
         Ok(match &self.kind {
             Kind::Cpu(precision) => Runner::Cpu(srn_cpu::executor(*precision, plan, self.budget)?),
-            Kind::Gpu(gpu) => Runner::Gpu(GpuExecutor::new(&gpu.without_cooperative(), plan, self.budget)?),
+            Kind::Gpu(gpu) => Runner::Gpu(GpuExecutor::new(&self.believed(gpu).without_cooperative(), plan, self.budget)?),
         })
+    }
+
+    /// The device, with the forms of kernels that are known to be right on it.
+    fn believed(&self, gpu: &Gpu) -> Gpu {
+        let proofs = self.proofs.lock().unwrap_or_else(PoisonError::into_inner);
+        proofs.plain.as_ref().unwrap_or(gpu).clone()
     }
 
     /// The same for one that looks for poses.
     pub(crate) fn prepare_descent(&self, plan: Plan) -> Result<Runner, ExecutorError> {
         match &self.kind {
-            Kind::Gpu(gpu) if self.is_cooperative() => Ok(Runner::Gpu(GpuExecutor::new(gpu, plan, self.budget)?)),
+            Kind::Gpu(gpu) if self.is_cooperative() => Ok(Runner::Gpu(GpuExecutor::new(&self.believed(gpu), plan, self.budget)?)),
             _ => self.prepare(plan),
         }
     }

@@ -1,0 +1,104 @@
+//! Whether a GPU computes what it should.
+//!
+//! Drivers have compiled kernels wrongly, and an adapter may compute nothing at all, without any error: a pose is found all the same,
+//! and it is anything. So a GPU is believed once its gradients, which need all kernels of their kind of work but those that take the step,
+//! are those of the CPU executor.
+
+use std::iter::zip;
+use std::sync::PoisonError;
+
+use srn_gpu::{Choice, Gpu};
+
+use super::Engine;
+use crate::Error;
+
+/// Most difference from the CPU executor's gradients, relative to the largest, in the median of the trials: in one of twenty a single ray makes rounding as
+/// large as a hundredth; a wrong kernel is wrong in all.
+const LIMIT: f64 = 0.01;
+
+/// Parts whose largest number is below this share of the largest of all are compared with that: they are rounding, more than anything.
+const SMALL: f64 = 1e-3;
+
+/// What is remembered of a device: all forms of kernels are right, or the plain ones alone.
+const AGREES: &str = "agrees";
+const AGREES_PLAIN: &str = "agrees/plain";
+
+/// Gradients of one trial, in parts of like numbers: tensors, say.
+pub(crate) type Trial = Vec<Vec<f64>>;
+
+/// What was found of a GPU.
+#[derive(Debug, Default)]
+pub(super) struct Proofs {
+    /// Kinds of work that it does as the CPU does.
+    works: Vec<&'static str>,
+    /// The same device with the plain forms of kernels, if others are wrong.
+    pub plain: Option<Gpu>,
+}
+
+impl Engine {
+    /// Compares some trials of a kind of work with the CPU executor's. Where only the plain forms of kernels agree the engine goes on with those; where
+    /// they do not, it fails. Done once for a device, its driver and the kernels' texts: the answer is kept where choices of variants are.
+    ///
+    /// Not where forms are [named](Choice::Named): whoever names one wants to see what it does.
+    pub(crate) fn prove(&self, work: &'static str, trials: impl Fn(&Engine) -> Result<Vec<Trial>, Error>) -> Result<(), Error> {
+        let Some(gpu) = self.as_gpu().filter(|gpu| matches!(gpu.choice(), Choice::Measured { .. })) else { return Ok(()) };
+        // Held to the end: who comes meanwhile waits for the answer.
+        let mut proofs = self.proofs.lock().unwrap_or_else(PoisonError::into_inner);
+        if proofs.works.contains(&work) {
+            return Ok(());
+        }
+        let plain = gpu.with_choice(Choice::Named("plain".into())).without_cooperative();
+        let is_plain = match gpu.remembered(work).as_deref() {
+            Some(AGREES) => false,
+            Some(AGREES_PLAIN) => true,
+            _ => {
+                let by = |engine: Engine| trials(&Engine { budget: self.budget, tile_rows: self.tile_rows, ..engine });
+                let expected = by(Engine::cpu())?;
+                if !(f64::MIN_POSITIVE..f64::INFINITY).contains(&largest(expected.iter().flatten().flatten())) {
+                    tracing::debug!(work, "nothing to compare the GPU's results with");
+                    return Ok(());
+                }
+                let off = |gpu: &Gpu| by(Engine::gpu(gpu.clone())).map(|found| median(zip(&found, &expected)));
+                let fast = off(&gpu.without_cooperative())?;
+                tracing::debug!(work, "the GPU's results differ from the CPU executor's by {fast:.1e} of the largest");
+                if fast > LIMIT {
+                    let difference = off(&plain)?;
+                    if difference > LIMIT {
+                        return Err(Error::Adapter { adapter: gpu.adapter().to_string(), work, difference });
+                    }
+                }
+                gpu.remember(work, if fast > LIMIT { AGREES_PLAIN } else { AGREES });
+                fast > LIMIT
+            }
+        };
+        if is_plain && proofs.plain.is_none() {
+            tracing::warn!("{} computes wrong results with the fast forms of kernels; the plain ones are used", gpu.adapter());
+            proofs.plain = Some(plain);
+        }
+        proofs.works.push(work);
+        Ok(())
+    }
+}
+
+/// The median difference of trials.
+fn median<'a>(trials: impl Iterator<Item = (&'a Trial, &'a Trial)>) -> f64 {
+    let mut differences: Vec<f64> = trials.map(|(found, expected)| difference(found, expected)).collect();
+    differences.sort_by(f64::total_cmp);
+    differences[differences.len() / 2]
+}
+
+/// The worst difference of all parts, each relative to its largest number; infinite where a number is not finite.
+pub(super) fn difference(found: &[Vec<f64>], expected: &[Vec<f64>]) -> f64 {
+    let least = (SMALL * largest(expected.iter().flatten())).max(f64::MIN_POSITIVE);
+    let parts = zip(found, expected).map(|(found, expected)| {
+        let apart: Vec<f64> = zip(found, expected).map(|(a, b)| a - b).collect();
+        largest(&apart) / largest(expected).max(least)
+    });
+    parts.fold(0.0, f64::max)
+}
+
+/// The largest magnitude; infinite where one is not finite.
+fn largest<'a>(values: impl IntoIterator<Item = &'a f64>) -> f64 {
+    let magnitude = |value: &f64| if value.is_finite() { value.abs() } else { f64::INFINITY };
+    values.into_iter().map(magnitude).fold(0.0, f64::max)
+}

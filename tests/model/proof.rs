@@ -1,0 +1,91 @@
+//! A GPU is believed once it has computed what the CPU executor does: faults are planted in its kernels.
+
+use std::fs;
+
+use sigma_srn::{Engine, Error, Gpu, Method, Model, Options, Phase, Query, Renderer, Train, Trainer, camera, estimate};
+use srn_gpu::Choice;
+use srn_tests::gpu;
+
+use crate::{SIZE, intrinsics, model};
+
+/// The test's device, its variants measured and nothing kept, with kernels that are called so changed.
+fn faulty(is_meant: fn(&str) -> bool, change: fn(String) -> String) -> Gpu {
+    let gpu = gpu().with_sources(move |kernel, variant| {
+        let text = kernel.source(variant);
+        if is_meant(&kernel.label(variant)) { change(text) } else { text }
+    });
+    gpu.with_choice(Choice::Measured { cache: None })
+}
+
+/// Nothing is written to any buffer, as by a driver that leaves all of them zero.
+fn does_nothing(text: String) -> String {
+    let main = text.find("fn main(").expect("every kernel has one");
+    let body = main + text[main..].find('{').expect("a body") + 1;
+    format!("{}\n    if true {{ return; }}{}", &text[..body], &text[body..])
+}
+
+/// The pose of a view, from a start near it.
+fn found(engine: &Engine) -> Result<[f64; 6], Error> {
+    let model = &model(true);
+    let [width, height] = SIZE;
+    let truth = camera::fixed24(1.3)[13];
+    let view = Renderer::new(&Engine::cpu(), model, 1, width, height)?.render(&[1], &[(truth, intrinsics())], 0)?;
+    let starts = vec![glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2) * truth];
+    let (intrinsics, rgb) = (intrinsics(), view.rgb);
+    let query = Query { instance: 1, intrinsics, width, height, rgb, weights: None, coverage: None, dilation: 0.0, starts };
+    let phases = vec![Phase { steps: 4, stride: 1, keep: usize::MAX, light: false, dilate: false }];
+    let options = Options { method: Method::Bfgs { soft: 1.0 }, min_starts: 0, phases, seed: 0 };
+    Ok(estimate(engine, model, &[query], &options, |_| Ok(()))?.remove(0).pose.0)
+}
+
+fn trained(engine: &Engine, model: Model, train: Train) -> Result<Trainer, Error> {
+    Trainer::new(engine, model, train, 1, 8)
+}
+
+#[test]
+fn an_adapter_that_computes_nothing_is_refused() {
+    let engine = Engine::gpu(faulty(|_| true, does_nothing));
+    let error = found(&engine).unwrap_err();
+    assert!(matches!(&error, Error::Adapter { difference, .. } if *difference > 0.9), "{error}");
+    let message = error.to_string();
+    assert!(message.contains(&gpu().adapter().name) && message.contains("gradients of poses"), "{message}");
+    for train in [Train::Codes, Train::Everything] {
+        let error = trained(&engine, model(true), train).err().expect("refused");
+        assert!(matches!(error, Error::Adapter { .. }), "{error}");
+    }
+}
+
+#[test]
+fn what_is_wrong_for_training_alone_does_not_keep_poses_from_being_found() {
+    let engine = Engine::gpu(faulty(|label| label.starts_with("linear/backward_weight"), does_nothing));
+    found(&engine).unwrap();
+    assert!(matches!(trained(&engine, model(true), Train::Everything), Err(Error::Adapter { .. })));
+}
+
+#[test]
+fn plain_forms_replace_faster_ones_that_are_wrong() {
+    let is_fast = |label: &str| ["_vec4", "_workgroup", "_subgroup"].iter().any(|form| label.ends_with(form));
+    let engine = Engine::gpu(faulty(is_fast, does_nothing));
+    let plain = Engine::gpu(gpu().with_choice(Choice::Named("plain".into())));
+    assert_eq!(found(&engine).unwrap(), found(&plain).unwrap());
+    trained(&engine, model(true), Train::Everything).unwrap();
+}
+
+#[test]
+fn an_adapter_is_tried_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let kept = || fs::read_to_string(folder.path().join("variants.txt")).unwrap_or_default();
+    let gpu = gpu().with_choice(Choice::Measured { cache: Some(folder.path().into()) });
+    let count = || kept().lines().filter(|line| line.ends_with(" agrees")).count();
+    found(&Engine::gpu(gpu.clone())).unwrap();
+    assert_eq!(count(), 1);
+    trained(&Engine::gpu(gpu.clone()), model(true), Train::Everything).unwrap();
+    assert_eq!(count(), 2, "another kind of work");
+    // What is kept is believed: told that the plain forms alone are right, the engine takes those.
+    fs::write(folder.path().join("variants.txt"), kept().replace(" agrees", " agrees/plain")).unwrap();
+    let plain = gpu.with_choice(Choice::Named("plain".into()));
+    assert_eq!(found(&Engine::gpu(gpu.clone())).unwrap(), found(&Engine::gpu(plain)).unwrap());
+    // Other texts are another matter.
+    let zero = gpu.with_sources(|kernel, variant| does_nothing(kernel.source(variant)));
+    assert!(matches!(found(&Engine::gpu(zero)), Err(Error::Adapter { .. })));
+}
