@@ -1,8 +1,8 @@
 //! The whole model: against golden values, finite differences and itself (other tiles, other executors), and what it does.
 
 use sigma_srn::{
-    Descent, Engine, Intrinsics, Loss, Method, Model, ModelConfig, Pose6, Rays, Shape, Train, Trainer, TrainingBatch, camera,
-    pixel_grid, stream,
+    Descent, Engine, Error, Intrinsics, Loss, Method, Model, ModelConfig, Pose6, Rays, Shape, Train, Trainer, TrainingBatch,
+    camera, pixel_grid, stream,
 };
 use srn_plan::{BufferId, Executor};
 
@@ -71,13 +71,20 @@ fn weights(method: Method, images: u32) -> Option<Vec<f32>> {
     (!gmsd).then(|| (0..images * RAYS).map(|k| [1.0, 0.0, 1.75, 0.5][(k * 31 % 97 % 4) as usize]).collect())
 }
 
+type NewDescent = fn(&Engine, &Model, Shape, Method) -> Result<Descent, Error>;
+
 /// A descent from [`poses`], ready to be evaluated; all instances but the first are looked for. Rays begin on a sphere, which some of them
 /// pass by: that they begin at the camera is tested against golden values.
 fn descent(engine: &Engine, method: Method, hypotheses: u32) -> Descent {
+    descent_by(Descent::new, engine, method, hypotheses)
+}
+
+/// The same by another constructor.
+fn descent_by(new: NewDescent, engine: &Engine, method: Method, hypotheses: u32) -> Descent {
     let shape = Shape { hypotheses, width: SIZE[0], height: SIZE[1], instances: INSTANCES - 1 };
     let mut model = model(true);
     model.metadata.ray_sphere = Some(0.6);
-    let mut descent = Descent::new(engine, &model, shape, method).unwrap();
+    let mut descent = new(engine, &model, shape, method).unwrap();
     let batch = batch(hypotheses);
     let instances: Vec<u32> = (1..INSTANCES).collect();
     let slots: Vec<u32> = batch.instances.iter().map(|instance| instance - 1).collect();

@@ -3,7 +3,7 @@
 use sigma_srn::{Descent, Engine, Error, Method, Renderer, Train};
 use srn_tests::{assert_close, difference, gpu};
 
-use crate::{RAYS, SIZE, batch, descent, intrinsics, methods, model, poses, trainer, weights};
+use crate::{RAYS, SIZE, batch, descent, descent_by, intrinsics, methods, model, poses, trainer, weights};
 
 /// Engines with the largest difference that passes, relative to the largest value of a tensor: other tiles, other order of sums.
 fn engines() -> [(Engine, f64); 3] {
@@ -37,6 +37,28 @@ fn many_tiles_give_the_descent_of_one() {
             for rows in [2 * RAYS + 5, 40, 11] {
                 let tiled = evaluated(descent(&engine.clone().with_tile_rows(rows), method, HYPOTHESES));
                 assert_same(&format!("{engine}, {method:?}, tiles of {rows}"), &tiled, &whole, tolerance);
+            }
+        }
+    }
+}
+
+#[test]
+fn poses_that_are_only_compared_give_the_same_in_less_memory() {
+    const HYPOTHESES: u32 = 5;
+    for (engine, tolerance) in engines() {
+        for method in methods() {
+            let [mut moving, mut still] = [Descent::new, Descent::still].map(|new| descent_by(new, &engine, method, HYPOTHESES));
+            assert!(3 * still.bytes() < 2 * moving.bytes(), "{} of {} bytes", still.bytes(), moving.bytes());
+            moving.compare().unwrap();
+            still.evaluate().unwrap();
+            still.descend().unwrap();
+            assert_eq!(still.gradients().unwrap(), Vec::<[f64; 6]>::new());
+            let [(losses, rgb), (still_losses, still_rgb)] =
+                [moving, still].map(|mut descent| (descent.losses().unwrap(), descent.rgb().unwrap()));
+            match method {
+                Method::Bfgs { .. } => assert_eq!((still_losses, still_rgb), (losses, rgb), "{engine}"),
+                // Whose matrices come from six numbers in `f32`.
+                Method::Adam { .. } => assert_close(&format!("{engine}, {method:?}"), &still_rgb, &rgb, tolerance.max(1e-6)),
             }
         }
     }

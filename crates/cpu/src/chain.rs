@@ -2,6 +2,7 @@
 //! next, so that what one step leaves is in the cache when the next one wants it.
 
 use std::cell::Cell;
+use std::collections::HashMap;
 use std::ops::Range;
 
 use srn_plan::{BufferId, Step};
@@ -207,6 +208,8 @@ pub(crate) struct Chain {
     pub steps: Range<usize>,
     pub links: Vec<Link>,
     pub places: Vec<Place>,
+    /// Numbers of the places that a buffer has.
+    places_of: HashMap<BufferId, Vec<usize>>,
     /// Rows of each block, in order; none where the step is done as a whole.
     pub blocks: Vec<Range<usize>>,
     rows: usize,
@@ -245,6 +248,7 @@ impl Chain {
             steps: number..number,
             links: vec![],
             places: vec![],
+            places_of: HashMap::new(),
             blocks: vec![],
             rows: split.rows,
             rows_per_group: None,
@@ -260,7 +264,7 @@ impl Chain {
         let parts_agree = agree(self.rows_per_group, split.rows_per_group) && agree(self.chunk_rows, split.chunk_rows);
         let bindings = || step.buffers.iter().zip(&split.shares).zip(step.kernel.bindings);
         let fits = |((&buffer, &share), binding): ((&BufferId, &Share), &srn_shaders::Binding)| {
-            let mut known = self.places.iter().filter(|place| place.buffer == buffer);
+            let mut known = self.places_of.get(&buffer).into_iter().flatten().map(|&place| &self.places[place]);
             known.all(|known| known.share == share || !known.written && !binding.written)
         };
         if split.rows != self.rows || !parts_agree || !bindings().all(fits) {
@@ -268,9 +272,10 @@ impl Chain {
         }
         let mut link = Link { inputs: vec![], outputs: vec![] };
         for ((&buffer, &share), binding) in bindings() {
-            let is_it = |place: &Place| place.buffer == buffer && place.share == share;
-            let place = self.places.iter().position(is_it).unwrap_or_else(|| {
+            let known = self.places_of.entry(buffer).or_default();
+            let place = known.iter().copied().find(|&place| self.places[place].share == share).unwrap_or_else(|| {
                 self.places.push(Place { buffer, share, written: false });
+                known.push(self.places.len() - 1);
                 self.places.len() - 1
             });
             self.places[place].written |= binding.written;

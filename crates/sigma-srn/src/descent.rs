@@ -90,15 +90,21 @@ struct Handles {
     /// What follows from the targets alone.
     targets: StageId,
     compare: StageId,
-    evaluate: StageId,
-    descend: StageId,
     loss: BufferId,
-    moves: Moves,
+    /// `None`: poses are only compared.
+    moves: Option<Moves>,
 }
 
-/// Buffers of the poses, by method.
+/// How poses move: two stages, and what they have by method.
 #[derive(Clone, Copy)]
-enum Moves {
+struct Moves {
+    evaluate: StageId,
+    descend: StageId,
+    by: By,
+}
+
+#[derive(Clone, Copy)]
+enum By {
     Adam { learning_rate: f64, pose6: BufferId, d_pose6: BufferId, schedule: BufferId, moments: [BufferId; 2] },
     Bfgs { begin: StageId, equations: BufferId, gradient: BufferId, state: BufferId, seeds: [BufferId; 3] },
 }
@@ -116,6 +122,15 @@ pub struct Descent {
 impl Descent {
     /// Plans and buffers for `shape`.
     pub fn new(engine: &Engine, model: &Model, shape: Shape, method: Method) -> Result<Self, Error> {
+        Self::make(engine, model, shape, method, true)
+    }
+
+    /// One whose poses are only compared, with little memory: evaluations have losses and no gradients, and steps do nothing.
+    pub fn still(engine: &Engine, model: &Model, shape: Shape, method: Method) -> Result<Self, Error> {
+        Self::make(engine, model, shape, method, false)
+    }
+
+    fn make(engine: &Engine, model: &Model, shape: Shape, method: Method, is_moving: bool) -> Result<Self, Error> {
         let Shape { hypotheses, width, height, instances } = shape;
         for (field, value) in [("hypotheses", hypotheses), ("width", width), ("height", height), ("instances", instances)] {
             if value == 0 {
@@ -128,11 +143,11 @@ impl Descent {
         }
         let rows = hypotheses * width * height;
         let on_host = OnHost::of(engine, model, 1);
-        let (plan, mut handles) =
-            engine.fit(rows, model.layout.features(), |b, tile_rows| build(b, model, shape, method, tile_rows, &on_host))?;
+        let (plan, mut handles) = engine
+            .fit(rows, model.layout.features(), |b, tile_rows| build(b, model, shape, method, is_moving, tile_rows, &on_host))?;
         let mut runner = engine.prepare_descent(plan)?;
         handles.instances.upload(&mut *runner, &handles.network, model)?;
-        if let Moves::Bfgs { seeds, .. } = handles.moves {
+        if let Some(By::Bfgs { seeds, .. }) = handles.moves.map(|moves| moves.by) {
             for (channel, seed) in seeds.into_iter().enumerate() {
                 let len = runner.plan().buffer(seed).len;
                 let values: Vec<f32> = (0..len).map(|k| if k % 3 == channel { SEED } else { 0.0 }).collect();
@@ -149,7 +164,7 @@ impl Descent {
 
     /// Floating-point operations of one step, matrix products only; not of the first after [`Descent::set_poses`], which may take more.
     pub fn flops_per_step(&self) -> u64 {
-        self.runner.plan().flops(self.handles.evaluate)
+        self.runner.plan().flops(self.evaluation())
     }
 
     /// What computes, in words.
@@ -159,10 +174,20 @@ impl Descent {
 
     /// Time on the device per kernel of one evaluation, longest first; `None` on the CPU.
     pub fn profile(&mut self) -> Result<Option<Vec<srn_gpu::KernelTime>>, Error> {
+        let stage = self.evaluation();
         match &mut self.runner {
-            Runner::Gpu(executor) => Ok(Some(executor.profile(self.handles.evaluate)?)),
+            Runner::Gpu(executor) => Ok(Some(executor.profile(stage)?)),
             Runner::Cpu(_) => Ok(None),
         }
+    }
+
+    /// The stage of an evaluation after the first.
+    fn evaluation(&self) -> StageId {
+        self.handles.moves.map_or(self.handles.compare, |moves| moves.evaluate)
+    }
+
+    fn by(&self) -> Option<By> {
+        self.handles.moves.map(|moves| moves.by)
     }
 
     /// Sets what is looked for: hypothesis `k` shows instance `instances[slot[k]]`; `rays` (without poses), `target_rgb
@@ -213,15 +238,15 @@ impl Descent {
 
     /// Sets the poses. Forgets momentum, second derivatives and best steps.
     pub fn set_poses(&mut self, poses: &[Pose6]) -> Result<(), Error> {
-        match self.handles.moves {
-            Moves::Adam { pose6, moments, .. } => {
+        match self.by() {
+            Some(By::Adam { pose6, moments, .. }) => {
                 let values: Vec<f64> = poses.iter().flat_map(|pose| pose.0).collect();
                 self.runner.write_f64(pose6, &values)?;
                 for moment in moments {
                     self.runner.write(moment, &vec![0.0; values.len()])?;
                 }
             }
-            Moves::Bfgs { .. } => {
+            Some(By::Bfgs { .. }) | None => {
                 let matrices: Vec<f64> = poses.iter().flat_map(|pose| to_rows(&pose.to_matrix())).collect();
                 self.runner.write_f64(self.handles.network.world_from_camera, &matrices)?;
             }
@@ -242,9 +267,9 @@ impl Descent {
 
     /// Renders at the poses; losses and gradients are ready to be read.
     pub fn evaluate(&mut self) -> Result<(), Error> {
-        let stage = match self.handles.moves {
-            Moves::Bfgs { begin, .. } if !self.begun => begin,
-            _ => self.handles.evaluate,
+        let stage = match self.by() {
+            Some(By::Bfgs { begin, .. }) if !self.begun => begin,
+            _ => self.evaluation(),
         };
         self.begun = true;
         Ok(self.runner.run(stage)?)
@@ -252,11 +277,12 @@ impl Descent {
 
     /// One step from what [`Descent::evaluate`] found.
     pub fn descend(&mut self) -> Result<(), Error> {
+        let Some(moves) = self.handles.moves else { return Ok(()) };
         self.steps += 1;
-        if let Moves::Adam { learning_rate, schedule, .. } = self.handles.moves {
+        if let By::Adam { learning_rate, schedule, .. } = moves.by {
             self.runner.write_f64(schedule, &adam::schedule(learning_rate, self.steps))?;
         }
-        Ok(self.runner.run(self.handles.descend)?)
+        Ok(self.runner.run(moves.descend)?)
     }
 
     /// Losses of the last comparison or evaluation, one per hypothesis.
@@ -266,23 +292,24 @@ impl Descent {
 
     /// The poses that the next evaluation renders.
     pub fn poses(&mut self) -> Result<Vec<Pose6>, Error> {
-        match self.handles.moves {
-            Moves::Adam { pose6, .. } => Ok(six_numbers(&self.runner.read(pose6)?).into_iter().map(Pose6).collect()),
-            Moves::Bfgs { .. } => Ok(poses(&self.runner.read(self.handles.network.world_from_camera)?)),
+        match self.by() {
+            Some(By::Adam { pose6, .. }) => Ok(six_numbers(&self.runner.read(pose6)?).into_iter().map(Pose6).collect()),
+            Some(By::Bfgs { .. }) | None => Ok(poses(&self.runner.read(self.handles.network.world_from_camera)?)),
         }
     }
 
     /// Gradients of the last evaluation with respect to the six numbers that a step changes: the camera's own for Adam; a turn
-    /// about the object and a shift, in the camera's axes, for BFGS.
+    /// about the object and a shift, in the camera's axes, for BFGS; none where poses are only compared.
     pub fn gradients(&mut self) -> Result<Vec<[f64; 6]>, Error> {
-        match self.handles.moves {
-            Moves::Adam { d_pose6, .. } => Ok(six_numbers(&self.runner.read(d_pose6)?)),
+        match self.by() {
+            None => Ok(vec![]),
+            Some(By::Adam { d_pose6, .. }) => Ok(six_numbers(&self.runner.read(d_pose6)?)),
             // The first evaluation has them from the residuals.
-            Moves::Bfgs { equations, .. } if self.steps == 0 => {
+            Some(By::Bfgs { equations, .. }) if self.steps == 0 => {
                 let rows = self.runner.read(equations)?;
                 Ok(rows.chunks_exact(bfgs::EQUATIONS as usize).flat_map(|row| six_numbers(&row[21..])).collect())
             }
-            Moves::Bfgs { gradient, .. } => Ok(six_numbers(&self.runner.read(gradient)?)),
+            Some(By::Bfgs { gradient, .. }) => Ok(six_numbers(&self.runner.read(gradient)?)),
         }
     }
 
@@ -305,8 +332,8 @@ impl Descent {
 
     /// States of BFGS, once it has begun.
     fn states(&mut self) -> Result<Option<Vec<f32>>, Error> {
-        match self.handles.moves {
-            Moves::Bfgs { state, .. } if self.begun => Ok(Some(self.runner.read(state)?)),
+        match self.by() {
+            Some(By::Bfgs { state, .. }) if self.begun => Ok(Some(self.runner.read(state)?)),
             _ => Ok(None),
         }
     }
@@ -335,6 +362,7 @@ fn build(
     model: &Model,
     shape: Shape,
     method: Method,
+    is_moving: bool,
     tile_rows: u32,
     on_host: &OnHost,
 ) -> Result<Handles, PlanError> {
@@ -342,12 +370,11 @@ fn build(
     let rays_per_image = width * height;
     let batch = Batch { images: hypotheses, rays: rays_per_image, slots };
     // Adam's matrices come from six numbers, those of BFGS are what it moves.
-    let pose_is_input = matches!(method, Method::Bfgs { .. });
+    let pose_is_input = matches!(method, Method::Bfgs { .. }) || !is_moving;
     let network = Network::new(b, model, batch, Trainable::Nothing, pose_is_input, &on_host.parameters)?;
     let cut = tiles(hypotheses, rays_per_image, tile_rows);
     let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1);
-    let saved = Saved::new(b, &network, Purpose::Pose, most)?;
-    let scratch = Scratch::new(b, &network, &saved, Sums::default())?;
+    let saved = Saved::new(b, &network, if is_moving { Purpose::Pose } else { Purpose::Render }, most)?;
     let gmsd = matches!(method, Method::Adam { loss: Loss::Gmsd, .. });
     let target = b.input("target", if gmsd { 3 } else { 4 } * hypotheses as usize * rays_per_image as usize)?;
 
@@ -358,30 +385,69 @@ fn build(
         Method::Bfgs { soft } => Some(image_loss::Kind::Charbonnier { soft }),
     };
     let comparison = Comparison::new(b, &cut, shape, loss)?;
-    let parts = Parts { network: &network, saved: &saved, scratch: &scratch, target, cut: &cut, comparison: &comparison, shape };
+    let parts = Parts { network: &network, saved: &saved, target, cut: &cut, comparison: &comparison, shape };
 
     let targets = b.stage("targets");
     parts.look_at_targets(b)?;
 
-    let (compare, evaluate, descend, moves) = match method {
+    let (compare, moves) = match method {
+        _ if !is_moving => (parts.still(b)?, None),
         Method::Adam { learning_rate, .. } => parts.adam(b, learning_rate)?,
         Method::Bfgs { soft } => parts.bfgs(b, soft)?,
     };
     let loss = comparison.loss;
-    Ok(Handles { network, target, gmsd, instances, targets, compare, evaluate, descend, loss, moves })
+    Ok(Handles { network, target, gmsd, instances, targets, compare, loss, moves })
 }
 
 /// How renders are compared, with the buffers for it.
 struct Comparison {
     kind: Kind,
-    tile_d_rgb: BufferId,
     partial: BufferId,
     loss: BufferId,
 }
 
 #[derive(Clone, Copy)]
 enum Kind {
-    /// `count`: of target values that are not white; `tile_target`: the tile's part of [`Handles::target`].
+    /// `count`: of target values that are not white.
+    PerPixel {
+        kind: image_loss::Kind,
+        count: BufferId,
+    },
+    Gmsd {
+        images: gmsd::Images,
+        saved: gmsd::Saved,
+    },
+}
+
+impl Comparison {
+    fn new(b: &mut Builder, cut: &[Tile], shape: Shape, loss: Option<image_loss::Kind>) -> Result<Self, PlanError> {
+        let Shape { hypotheses, width, height, .. } = shape;
+        let n = hypotheses as usize;
+        let images = gmsd::Images { count: hypotheses, width, height };
+        let of_tile = |tile: &Tile| rays::partial_len(tile.rows).max(bfgs::partial_len(tile.rows));
+        let of_images = image_loss::partial_len(hypotheses, width * height).max(images.partial_len());
+        let partial = b.scratch("partial sums", cut.iter().map(of_tile).max().unwrap_or(1).max(of_images))?;
+        let kind = match loss {
+            Some(kind) => Kind::PerPixel { kind, count: b.scratch("target count", n)? },
+            None => {
+                let pooled = n * images.pooled() as usize;
+                let saved = gmsd::Saved {
+                    luma: b.scratch("luma", pooled)?,
+                    target_luma: b.scratch("target luma", pooled)?,
+                    quality: b.scratch("quality", pooled)?,
+                    moments: b.scratch("moments", 2 * n)?,
+                };
+                Kind::Gmsd { images, saved }
+            }
+        };
+        Ok(Comparison { kind, partial, loss: b.scratch("loss", n)? })
+    }
+}
+
+/// What the way back begins with.
+#[derive(Clone, Copy)]
+enum Back {
+    /// `tile_target`: the tile's part of [`Handles::target`].
     PerPixel {
         kind: image_loss::Kind,
         count: BufferId,
@@ -395,48 +461,18 @@ enum Kind {
     },
 }
 
-impl Comparison {
-    fn new(b: &mut Builder, cut: &[Tile], shape: Shape, loss: Option<image_loss::Kind>) -> Result<Self, PlanError> {
-        let Shape { hypotheses, width, height, .. } = shape;
-        let (n, most) = (hypotheses as usize, cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1) as usize);
-        let images = gmsd::Images { count: hypotheses, width, height };
-        let of_tile = |tile: &Tile| rays::partial_len(tile.rows).max(bfgs::partial_len(tile.rows));
-        let of_images = image_loss::partial_len(hypotheses, width * height).max(images.partial_len());
-        let partial = b.scratch("partial sums", cut.iter().map(of_tile).max().unwrap_or(1).max(of_images))?;
-        let kind = match loss {
-            Some(kind) => {
-                let (count, tile_target) = (b.scratch("target count", n)?, b.scratch("tile target", 4 * most)?);
-                Kind::PerPixel { kind, count, tile_target }
-            }
-            None => {
-                let pooled = n * images.pooled() as usize;
-                let saved = gmsd::Saved {
-                    luma: b.scratch("luma", pooled)?,
-                    target_luma: b.scratch("target luma", pooled)?,
-                    quality: b.scratch("quality", pooled)?,
-                    moments: b.scratch("moments", 2 * n)?,
-                };
-                let d_rgb = b.scratch("d rgb", 3 * n * (width * height) as usize)?;
-                Kind::Gmsd { images, saved, d_response: b.scratch("d response", 2 * pooled)?, d_rgb }
-            }
-        };
-        Ok(Comparison { kind, tile_d_rgb: b.scratch("tile d rgb", 3 * most)?, partial, loss: b.scratch("loss", n)? })
-    }
-}
-
 /// What both methods work with.
 struct Parts<'a> {
     network: &'a Network,
     saved: &'a Saved,
-    scratch: &'a Scratch,
     target: BufferId,
     cut: &'a [Tile],
     comparison: &'a Comparison,
     shape: Shape,
 }
 
-/// Stages "compare", "evaluate" and "descend", and the buffers of the poses.
-type Stages = (StageId, StageId, StageId, Moves);
+/// The stage "compare", and how poses move.
+type Stages = (StageId, Option<Moves>);
 
 impl Parts<'_> {
     /// Per-pixel losses need the number of target values that are not white; GMSD needs the target's luma.
@@ -446,7 +482,7 @@ impl Parts<'_> {
             Kind::PerPixel { count, .. } => {
                 image_loss::count(b, hypotheses, width * height, self.target, self.comparison.partial, count)
             }
-            Kind::Gmsd { images, saved, .. } => gmsd::pool(b, images, self.target, saved.target_luma),
+            Kind::Gmsd { images, saved } => gmsd::pool(b, images, self.target, saved.target_luma),
         }
     }
 
@@ -455,11 +491,11 @@ impl Parts<'_> {
         let Shape { hypotheses, width, height, .. } = self.shape;
         let &Comparison { kind, partial, loss, .. } = self.comparison;
         match kind {
-            Kind::PerPixel { kind, count, .. } => {
+            Kind::PerPixel { kind, count } => {
                 let pixels = width * height;
                 image_loss::forward(b, kind, hypotheses, pixels, self.network.rgb, self.target, count, partial, loss)
             }
-            Kind::Gmsd { images, saved, .. } => {
+            Kind::Gmsd { images, saved } => {
                 gmsd::pool(b, images, self.network.rgb, saved.luma)?;
                 gmsd::similarity(b, images, saved)?;
                 gmsd::deviation(b, images, saved, partial, loss)
@@ -475,25 +511,52 @@ impl Parts<'_> {
         self.losses(b)
     }
 
+    /// The poses are given, and stay.
+    fn still(&self, b: &mut Builder) -> Result<StageId, PlanError> {
+        let compare = b.stage("compare");
+        self.compare(b)?;
+        Ok(compare)
+    }
+
+    /// Rows of the largest tile.
+    fn most_rows(&self) -> usize {
+        self.cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1) as usize
+    }
+
+    fn back(&self, b: &mut Builder) -> Result<Back, PlanError> {
+        Ok(match self.comparison.kind {
+            Kind::PerPixel { kind, count } => {
+                Back::PerPixel { kind, count, tile_target: b.scratch("tile target", 4 * self.most_rows())? }
+            }
+            Kind::Gmsd { images, saved } => {
+                let Shape { hypotheses, width, height, .. } = self.shape;
+                let d_rgb = b.scratch("d rgb", 3 * (hypotheses * width * height) as usize)?;
+                let d_response = b.scratch("d response", 2 * (hypotheses * images.pooled()) as usize)?;
+                Back::Gmsd { images, saved, d_response, d_rgb }
+            }
+        })
+    }
+
     /// Renders, compares, and goes back to the poses: losses, and `d_matrix [hypotheses, 12]`.
-    fn differentiate(&self, b: &mut Builder, d_matrix: BufferId) -> Result<(), PlanError> {
-        let &Parts { network, saved, scratch, target, cut, comparison, shape: Shape { width, height, .. } } = self;
-        let &Comparison { kind, tile_d_rgb, partial, loss } = comparison;
+    fn differentiate(&self, b: &mut Builder, scratch: &Scratch, back: Back, d_matrix: BufferId) -> Result<(), PlanError> {
+        let &Parts { network, saved, target, cut, comparison, shape: Shape { width, height, .. } } = self;
+        let &Comparison { partial, loss, .. } = comparison;
+        let tile_d_rgb = b.scratch("tile d rgb", 3 * self.most_rows())?;
         let mut started = Started::default();
         // A loss of whole images needs all tiles before the first gradient; the tiles are rendered once more on the way back.
-        if let Kind::Gmsd { images, saved: maps, d_response, d_rgb } = kind {
+        if let Back::Gmsd { images, saved: maps, d_response, d_rgb } = back {
             self.compare(b)?;
             gmsd::backward(b, images, 1.0, maps, loss, d_response, d_rgb)?;
         }
         for &tile in cut {
-            match kind {
-                Kind::PerPixel { kind, count, tile_target } => {
+            match back {
+                Back::PerPixel { kind, count, tile_target } => {
                     forward::render(b, network, saved, tile)?;
                     tile_ops::gather(b, tile, 4, target, tile_target)?;
                     let pixels = width * height;
                     image_loss::backward(b, kind, tile.rows, pixels, 1.0, saved.rgb(), tile_target, count, tile_d_rgb)?;
                 }
-                Kind::Gmsd { d_rgb, .. } => {
+                Back::Gmsd { d_rgb, .. } => {
                     if cut.len() > 1 {
                         forward::render(b, network, saved, tile)?;
                     }
@@ -505,7 +568,7 @@ impl Parts<'_> {
             let pixels = network.pixels(saved);
             rays::backward(b, tile.rows, pixels, scratch.d_origin, scratch.d_direction, partial, d_matrix, accumulate)?;
         }
-        if matches!(kind, Kind::PerPixel { .. }) {
+        if matches!(back, Back::PerPixel { .. }) {
             self.losses(b)?;
         }
         Ok(())
@@ -514,6 +577,7 @@ impl Parts<'_> {
     /// The paper's method.
     fn adam(&self, b: &mut Builder, learning_rate: f64) -> Result<Stages, PlanError> {
         let (poses, n) = (self.shape.hypotheses, self.shape.hypotheses as usize);
+        let (scratch, back) = (Scratch::new(b, self.network, self.saved, Sums::default())?, self.back(b)?);
         let pose6 = b.input("pose6", 6 * n)?;
         let (d_pose6, d_matrix) = (b.scratch("d pose6", 6 * n)?, b.scratch("d world_from_camera", 12 * n)?);
 
@@ -523,24 +587,26 @@ impl Parts<'_> {
 
         let evaluate = b.stage("evaluate");
         pose::forward(b, poses, pose6, self.network.world_from_camera)?;
-        self.differentiate(b, d_matrix)?;
+        self.differentiate(b, &scratch, back, d_matrix)?;
         pose::backward(b, poses, pose6, d_matrix, d_pose6)?;
 
         let descend = b.stage("descend");
         let schedule = b.input("schedule", 3)?;
         let moments = [b.input("m pose6", 6 * n)?, b.input("v pose6", 6 * n)?];
         adam::step(b, 6 * poses, d_pose6, schedule, pose6, moments[0], moments[1])?;
-        Ok((compare, evaluate, descend, Moves::Adam { learning_rate, pose6, d_pose6, schedule, moments }))
+        let by = By::Adam { learning_rate, pose6, d_pose6, schedule, moments };
+        Ok((compare, Some(Moves { evaluate, descend, by })))
     }
 
     /// BFGS. Its first evaluation is another stage, "begin": rays are independent, so one backward pass for each channel, begun with the
     /// same number for every ray, gives every ray's derivative of that channel, the rows of the Jacobian.
     fn bfgs(&self, b: &mut Builder, soft: f32) -> Result<Stages, PlanError> {
-        let &Parts { network, saved, scratch, target, cut, comparison, shape: Shape { hypotheses, width, height, .. } } = self;
-        let &Comparison { kind, partial, loss, .. } = comparison;
-        let Kind::PerPixel { tile_target, .. } = kind else { unreachable!("BFGS compares pixel by pixel") };
+        let &Parts { network, saved, target, cut, comparison, shape: Shape { hypotheses, width, height, .. } } = self;
+        let &Comparison { partial, loss, .. } = comparison;
+        let (scratch, back) = (Scratch::new(b, network, saved, Sums::default())?, self.back(b)?);
+        let Back::PerPixel { tile_target, .. } = back else { unreachable!("BFGS compares pixel by pixel") };
         let n = hypotheses as usize;
-        let most = cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1) as usize;
+        let most = self.most_rows();
         let mut seed = |name: &str| b.input(name, 3 * most);
         let seeds = [seed("seed of red")?, seed("seed of green")?, seed("seed of blue")?];
         let equations = b.scratch("equations", n * bfgs::EQUATIONS as usize)?;
@@ -567,7 +633,7 @@ impl Parts<'_> {
             forward::render(b, network, saved, tile)?;
             tile_ops::gather(b, tile, 4, target, tile_target)?;
             for (number, d_rgb) in (0..).zip(seeds) {
-                backward::render(b, network, saved, scratch, tile, d_rgb, false, &mut started)?;
+                backward::render(b, network, saved, &scratch, tile, d_rgb, false, &mut started)?;
                 let channel = Channel { number, seed: SEED, scale, soft };
                 let accumulate = started.accumulate(equations, tile.rows.first_group);
                 bfgs::equations(b, tile.rows, residuals, channel, partial, equations, accumulate)?;
@@ -577,12 +643,13 @@ impl Parts<'_> {
         bfgs::begin(b, hypotheses, equations, loss, network.world_from_camera, state)?;
 
         let evaluate = b.stage("evaluate");
-        self.differentiate(b, d_matrix)?;
+        self.differentiate(b, &scratch, back, d_matrix)?;
         bfgs::gradient(b, hypotheses, network.world_from_camera, d_matrix, gradient)?;
         bfgs::update(b, hypotheses, gradient, loss, network.world_from_camera, state)?;
 
         let descend = b.stage("descend");
         bfgs::solve(b, hypotheses, network.world_from_camera, state)?;
-        Ok((compare, evaluate, descend, Moves::Bfgs { begin, equations, gradient, state, seeds }))
+        let by = By::Bfgs { begin, equations, gradient, state, seeds };
+        Ok((compare, Some(Moves { evaluate, descend, by })))
     }
 }

@@ -270,7 +270,7 @@ pub fn estimate(
     }
     let gradients_of = |engine: &Engine, tried: &[Hypothesis], stride: u32| {
         let phase = Phase { stride, ..options.phases[0] };
-        let (mut descent, _) = prepare(engine, model, queries, options, &phase, tried)?;
+        let (mut descent, _) = prepare(engine, model, queries, options, &phase, true, tried)?;
         descent.evaluate()?;
         descent.gradients()
     };
@@ -311,7 +311,8 @@ pub fn estimate(
         }
         let names: Vec<(usize, usize)> = running.iter().map(|h| (h.query, h.start)).collect();
         let mut descent;
-        (descent, lights) = prepare(engine, model, queries, options, phase, &running)?;
+        let is_moving = phase.steps > 0 || Some(number) == last;
+        (descent, lights) = prepare(engine, model, queries, options, phase, is_moving, &running)?;
         let rows = running.len() * rays_of(&queries[0], phase.stride).count();
         for _ in 0..phase.steps {
             // New depths in every step, as in the paper; but whether BFGS keeps a step must not depend on luck.
@@ -521,51 +522,51 @@ impl Targets {
         Some(Targets { shape, instances, slots, rays, rgb, weights: Some(counts) })
     }
 
-    fn set(&self, descent: &mut Descent) -> Result<(), Error> {
-        descent.set_targets(&self.instances, &self.slots, &self.rays, &self.rgb, self.weights.as_deref())
-    }
-
-    fn descent(&self, engine: &Engine, model: &Model, method: Method, running: &[Hypothesis]) -> Result<Descent, Error> {
-        let mut descent = Descent::new(engine, model, self.shape, method)?;
-        self.set(&mut descent)?;
+    /// At the hypotheses' poses; from there they move, or are only compared.
+    fn descent(
+        &self,
+        engine: &Engine,
+        model: &Model,
+        method: Method,
+        is_moving: bool,
+        running: &[Hypothesis],
+    ) -> Result<Descent, Error> {
+        let new = if is_moving { Descent::new } else { Descent::still };
+        let mut descent = new(engine, model, self.shape, method)?;
+        descent.set_targets(&self.instances, &self.slots, &self.rays, &self.rgb, self.weights.as_deref())?;
         let poses: Vec<Pose6> = running.iter().map(|h| h.pose).collect();
         descent.set_poses(&poses)?;
         Ok(descent)
     }
 }
 
-/// The descent of a phase, and the light of each query that it makes up for.
+/// The descent of a phase, whose poses move or are only compared, and the light of each query that it makes up for.
 fn prepare(
     engine: &Engine,
     model: &Model,
     queries: &[Query],
     options: &Options,
     phase: &Phase,
+    is_moving: bool,
     running: &[Hypothesis],
 ) -> Result<(Descent, Vec<Option<Light>>), Error> {
     let mut targets = Targets::new(queries, phase, running, options.seed);
-    let mut descent = targets.descent(engine, model, options.method, running)?;
     let mut lights = vec![None; queries.len()];
     let makes_up = phase.light && queries.iter().any(|query| query.coverage.is_some());
     // The paper's way compares whole images.
     let looks_closer = phase.steps > 0 && matches!(options.method, Method::Bfgs { .. });
-    if !makes_up && !looks_closer {
-        return Ok((descent, lights));
-    }
-    descent.compare()?;
-    let renders = descent.rgb()?;
-    if makes_up {
-        lights = targets.undo_lights(queries, phase.stride, running, &renders);
-    }
-    match targets.in_regions(&renders).filter(|_| looks_closer) {
-        Some(targets) => {
-            // Its buffers, before there are others.
-            drop(descent);
-            descent = targets.descent(engine, model, options.method, running)?;
+    if makes_up || looks_closer {
+        let mut views = targets.descent(engine, model, options.method, false, running)?;
+        views.compare()?;
+        let renders = views.rgb()?;
+        if makes_up {
+            lights = targets.undo_lights(queries, phase.stride, running, &renders);
         }
-        None => targets.set(&mut descent)?,
+        if looks_closer {
+            targets = targets.in_regions(&renders).unwrap_or(targets);
+        }
     }
-    Ok((descent, lights))
+    Ok((targets.descent(engine, model, options.method, is_moving, running)?, lights))
 }
 
 fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Error> {
