@@ -164,6 +164,17 @@ pub fn refuse_existing(paths: impl IntoIterator<Item = PathBuf>, force: bool) ->
     }
 }
 
+/// Fails if a file is there already, or has no folder to be in: found out now rather than after the work.
+pub fn refuse_to_write(path: &Path, force: bool) -> Result<()> {
+    refuse_existing([path.to_owned()], force)?;
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() && !folder.is_dir() => {
+            Err(format!("{}: its folder does not exist", path.display()).into())
+        }
+        _ => Ok(()),
+    }
+}
+
 /// Prints a result on stdout; a full disk or a closed pipe is an error, not a panic.
 pub fn print(text: &str) -> Result<()> {
     use std::io::Write;

@@ -11,7 +11,7 @@ use srn_data::formats::{self, Format, ReadOptions, WriteOptions, Written, bop};
 use srn_data::inspect::{self, Origin};
 use srn_data::target::MARGIN;
 
-use crate::common::{Result, axes, named, progress, refuse_existing};
+use crate::common::{Result, axes, named, progress, refuse_existing, refuse_to_write};
 use crate::meshes;
 
 /// Flags that say what a source is, and how it differs from what its format promises.
@@ -341,7 +341,7 @@ impl Export {
             return Err(format!("{}: no view of {} has a pose there", self.path.display(), show(self.poses.as_deref())).into());
         }
         let Target::Format(format) = self.format else {
-            refuse_existing([self.out.clone()], self.force)?;
+            refuse_to_write(&self.out, self.force)?;
             bop::write_results(&self.out, &results, self.force)?;
             println!("{}: {} estimates", self.out.display(), results.len());
             return Ok(true);
@@ -397,7 +397,7 @@ impl Inspect {
     /// Runs the command; false where something is wrong.
     pub fn run(&self) -> Result<bool> {
         let Some(path) = &self.path else { return meshes::inspect(&self.meshes, self.json) };
-        refuse_existing(self.out.iter().cloned(), self.force)?;
+        self.out.iter().try_for_each(|out| refuse_to_write(out, self.force))?;
         let (format, mut captures) = self.source.read(path)?;
         let origin = if format == Format::Srn { Origin::Given } else { Origin::Found };
         if origin == Origin::Found {

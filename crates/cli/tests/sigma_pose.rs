@@ -409,6 +409,11 @@ fn bad_calls_end_with_2_and_one_line() {
         (format!("render {model} --instance seat --out seat.png --pose nan.txt"), &["nan.txt"]),
         (format!("render {model} --instance seat --out seat.png --pose nan.txt --azimuth 3"), &["--azimuth"]),
         (format!("render {model} --instance seat --out model.safetensors/seat.png --executor cpu"), &["model.safetensors/seat"]),
+        // Before the work, not after it.
+        (format!("render {model} --instance seat --out no/seat.gif --orbit 3"), &["no/seat.gif", "folder does not exist"]),
+        (format!("track DATA/{CHICKEN} {model} --record no/track.gif"), &["no/track.gif", "folder does not exist"]),
+        (format!("calibrate {model} --data DATA --out no/model.safetensors"), &["no/model", "folder does not exist"]),
+        (format!("bake {model} --instance seat --out no/seat.safetensors"), &["no/seat", "folder does not exist"]),
     ] {
         fail(dir, &args, words);
     }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::common::{Result, about_model, load_model, print, refuse_existing};
+use crate::common::{Result, about_model, load_model, print, refuse_to_write};
 
 /// Flags of `sigma-pose bake`.
 #[derive(Args, Debug)]
@@ -25,7 +25,7 @@ pub struct Bake {
 
 /// Runs the command.
 pub fn run(args: &Bake) -> Result<bool> {
-    refuse_existing([args.out.clone()], args.force)?;
+    refuse_to_write(&args.out, args.force)?;
     let model = load_model(&args.model)?;
     let about = |error| about_model(&args.model, error);
     let baked = model.bake(model.instance(&args.instance).map_err(about)?).map_err(about)?;

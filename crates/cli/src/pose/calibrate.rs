@@ -12,7 +12,7 @@ use super::files::Picture;
 use super::notation::Notation;
 use super::search::{Found, On, PoseError, SearchArgs, Starts, View, render, unexplained};
 use super::views::{self, Views, spread};
-use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
+use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_to_write};
 
 /// Where no search failed: the limits of what is unexplained, over the most that was.
 const MARGIN: f64 = 1.5;
@@ -98,7 +98,7 @@ impl Known {
 pub fn run(args: &Calibrate) -> Result<bool> {
     let mut model = load_model(&args.model)?;
     let (side, all) = views::open(&model, &args.data, u32::MAX, u32::MAX)?;
-    refuse_existing([args.out.clone()], args.force)?;
+    refuse_to_write(&args.out, args.force)?;
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
     let at_truth = AtTruth::of(on, &all)?;

@@ -14,7 +14,7 @@ use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
 use super::search::{Confidence, Found, On, PoseError, SearchArgs, Starts};
-use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing};
+use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing, refuse_to_write};
 
 /// Flags of `sigma-pose estimate`.
 #[derive(Args, Debug)]
@@ -153,7 +153,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
         if pictures.len() > 1 {
             return Err("--save-model is for one picture".into());
         }
-        refuse_existing([path.clone()], args.force)?;
+        refuse_to_write(path, args.force)?;
     }
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };

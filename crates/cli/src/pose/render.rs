@@ -15,7 +15,7 @@ use super::files::{CameraArgs, instance_of, write_gif, write_png};
 use super::notation::NotationArgs;
 use super::search::{On, render};
 use super::{draw, positive};
-use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
+use crate::common::{EngineArgs, Result, load_model, print, refuse_existing, refuse_to_write};
 
 /// Side of a view where neither the flags nor the model say it, pixels.
 const SIDE: u32 = 64;
@@ -79,7 +79,8 @@ pub fn run(args: &Render) -> Result<bool> {
     match (kind.as_str(), args.orbit) {
         ("gif", None) => return Err(format!("{}: an animation needs --orbit", args.out.display()).into()),
         ("png", Some(_)) => return Err(format!("{}: an orbit is written to a .gif or a folder", args.out.display()).into()),
-        ("png" | "gif" | "", _) => refuse_existing([args.out.clone()], args.force)?,
+        ("png" | "gif", _) => refuse_to_write(&args.out, args.force)?,
+        ("", _) => refuse_existing([args.out.clone()], args.force)?,
         _ => return Err(format!("{}: expected a .png, a .gif or a folder", args.out.display()).into()),
     }
 

@@ -11,7 +11,7 @@ use super::draw;
 use super::files::{Animation, ObjectArgs, Picture, PoseSource, mask_of, model_side};
 use super::notation::NotationArgs;
 use super::search::{Confidence, Found, On, PoseError, SearchArgs, Starts};
-use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
+use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
 
 /// Side of a frame in the animation, pixels.
 const SHOWN: u32 = 192;
@@ -83,7 +83,7 @@ pub fn run(args: &Track) -> Result<bool> {
     let mut frames = frames(&args.frames)?;
     let notation = args.poses.open()?;
     if let Some(path) = &args.record {
-        refuse_existing([path.clone()], args.force)?;
+        refuse_to_write(path, args.force)?;
     }
     let engine = args.search.open(&args.engine)?;
     // Whoever waits for a frame is ready for it.

@@ -167,10 +167,7 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
     if args.out.exists() {
         return Err(format!("{out}: exists already, nothing was overwritten").into());
     }
-    // Found out now rather than after the fit.
-    if args.out.parent().is_some_and(|folder| !folder.as_os_str().is_empty() && !folder.is_dir()) {
-        return Err(format!("{out}: its folder does not exist").into());
-    }
+    common::refuse_to_write(&args.out, false)?;
     let model = common::load_model(&args.model)?;
     let side = args.side.or(model.metadata.side).ok_or("the model file names no image side; give --side")?;
     let set = common::load_set(&args.data, side)?;

@@ -6,7 +6,7 @@ use clap::Args;
 use sigma_srn::{Metadata, Model};
 
 use super::settings::{positive, up_to};
-use crate::common::{Result, about_model, load_model, print, refuse_existing};
+use crate::common::{Result, about_model, load_model, print, refuse_to_write};
 
 /// Flags of `sigma-train import`.
 #[derive(Args, Debug)]
@@ -40,7 +40,7 @@ pub struct ImportArgs {
 
 /// Reads a checkpoint and writes the model.
 pub fn import(args: &ImportArgs) -> Result<bool> {
-    refuse_existing([args.out.clone()], args.force)?;
+    refuse_to_write(&args.out, args.force)?;
     let instance_names = match &args.names {
         Some(path) => {
             let text = std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
@@ -85,7 +85,7 @@ pub struct ExportArgs {
 
 /// Writes a model as a checkpoint.
 pub fn export(args: &ExportArgs) -> Result<bool> {
-    refuse_existing([args.out.clone()], args.force)?;
+    refuse_to_write(&args.out, args.force)?;
     let model = load_model(&args.model)?;
     model.save_torch(&args.out).map_err(|error| about_model(&args.model, error))?;
     print(&format!("{}: {} tensors", args.out.display(), model.tensors().len()))?;
