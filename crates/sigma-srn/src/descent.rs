@@ -103,6 +103,7 @@ struct Moves {
     by: By,
 }
 
+/// Buffers of the poses, by method.
 #[derive(Clone, Copy)]
 enum By {
     Adam { learning_rate: f64, pose6: BufferId, d_pose6: BufferId, schedule: BufferId, moments: [BufferId; 2] },
@@ -518,15 +519,11 @@ impl Parts<'_> {
         Ok(compare)
     }
 
-    /// Rows of the largest tile.
-    fn most_rows(&self) -> usize {
-        self.cut.iter().map(|tile| tile.rows.count()).max().unwrap_or(1) as usize
-    }
-
+    /// Buffers for the way back.
     fn back(&self, b: &mut Builder) -> Result<Back, PlanError> {
         Ok(match self.comparison.kind {
             Kind::PerPixel { kind, count } => {
-                Back::PerPixel { kind, count, tile_target: b.scratch("tile target", 4 * self.most_rows())? }
+                Back::PerPixel { kind, count, tile_target: b.scratch("tile target", 4 * self.saved.rows as usize)? }
             }
             Kind::Gmsd { images, saved } => {
                 let Shape { hypotheses, width, height, .. } = self.shape;
@@ -541,7 +538,7 @@ impl Parts<'_> {
     fn differentiate(&self, b: &mut Builder, scratch: &Scratch, back: Back, d_matrix: BufferId) -> Result<(), PlanError> {
         let &Parts { network, saved, target, cut, comparison, shape: Shape { width, height, .. } } = self;
         let &Comparison { partial, loss, .. } = comparison;
-        let tile_d_rgb = b.scratch("tile d rgb", 3 * self.most_rows())?;
+        let tile_d_rgb = b.scratch("tile d rgb", 3 * saved.rows as usize)?;
         let mut started = Started::default();
         // A loss of whole images needs all tiles before the first gradient; the tiles are rendered once more on the way back.
         if let Back::Gmsd { images, saved: maps, d_response, d_rgb } = back {
@@ -606,8 +603,7 @@ impl Parts<'_> {
         let (scratch, back) = (Scratch::new(b, network, saved, Sums::default())?, self.back(b)?);
         let Back::PerPixel { tile_target, .. } = back else { unreachable!("BFGS compares pixel by pixel") };
         let n = hypotheses as usize;
-        let most = self.most_rows();
-        let mut seed = |name: &str| b.input(name, 3 * most);
+        let mut seed = |name: &str| b.input(name, 3 * saved.rows as usize);
         let seeds = [seed("seed of red")?, seed("seed of green")?, seed("seed of blue")?];
         let equations = b.scratch("equations", n * bfgs::EQUATIONS as usize)?;
         let (state, gradient) = (b.scratch("state", n * bfgs::STATE as usize)?, b.scratch("gradient", 6 * n)?);

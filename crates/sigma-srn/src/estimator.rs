@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use crate::camera::{Intrinsics, Pose6};
 use crate::descent::{Descent, Loss, Method, Shape};
-use crate::engine::Engine;
+use crate::engine::{Engine, proof};
 use crate::light::Light;
 use crate::mask::{DILATIONS, best_dilation, dilated, has_outline};
 use crate::model::Model;
@@ -21,8 +21,6 @@ const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
 
 /// Hypotheses that a GPU, and cooperative matrices, are tried on.
 const TRIED: usize = 8;
-/// Most rays to a side of the pictures that a GPU is tried on.
-const PROOF_SIDE: u32 = 16;
 
 /// An image whose camera pose is wanted.
 #[derive(Clone, Debug)]
@@ -275,13 +273,13 @@ pub fn estimate(
         descent.gradients()
     };
     engine.prove("poses", |engine| {
-        // As many of them from one start alone, and no more rays of each than a look casts: the CPU has to do the same.
+        // As many of them from one start alone.
         let around = |h: &Hypothesis| {
             let at = |matrix: DMat4| Hypothesis { pose: Pose6::from_matrix(&matrix), ..*h };
             turned(&h.pose.to_matrix()).map(at).collect::<Vec<_>>()
         };
         let tried: Vec<Hypothesis> = hypotheses.iter().copied().chain(hypotheses.iter().flat_map(around)).take(TRIED).collect();
-        let stride = if is_gmsd(options.method) { 1 } else { queries[0].width.max(queries[0].height).div_ceil(PROOF_SIDE) };
+        let stride = if is_gmsd(options.method) { 1 } else { queries[0].width.max(queries[0].height).div_ceil(proof::SIDE) };
         Ok(gradients_of(engine, &tried, stride)?.iter().map(|six| vec![six.to_vec()]).collect())
     })?;
     engine

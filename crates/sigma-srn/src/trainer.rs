@@ -9,7 +9,7 @@ use srn_plan::ops::{adam, depth, depth_loss, image_loss, latent_loss, tile as ti
 use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, Tile, tiles};
 
 use crate::camera::{Intrinsics, fixed24};
-use crate::engine::{Engine, Runner};
+use crate::engine::{Engine, Runner, proof};
 use crate::model::{Model, Tensors, read_tensors, write_tensors};
 use crate::network::backward::{self, HyperScratch};
 use crate::network::streamed::{OnHost, Streamed};
@@ -25,9 +25,8 @@ const LATENT_WEIGHT: f64 = 1.0;
 /// Weight of the depth term: 1e-3 of the regulariser's 1e4.
 const DEPTH_WEIGHT: f64 = 10.0;
 
-/// Images that a GPU is tried on, one at a time, their side in pixels, and most numbers of a tensor that are looked at.
+/// Images that a GPU is tried on, one at a time, and most numbers of a tensor that are looked at.
 const PROOFS: u32 = 3;
-const PROOF_SIDE: u32 = 16;
 const PROOF_VALUES: usize = 4096;
 
 /// What is trained.
@@ -55,10 +54,10 @@ impl TrainingBatch {
     fn noise(model: &Model, number: u32) -> Self {
         let mut random = stream(0, number.into());
         let mut rays = Rays::default();
-        let side = f64::from(PROOF_SIDE);
+        let side = f64::from(proof::SIDE);
         let intrinsics = Intrinsics { fx: side, fy: side, cx: side / 2.0, cy: side / 2.0, pixel_center: 0.5 };
         let camera = fixed24(model.metadata.orbit_radius.unwrap_or(1.3))[7 * number as usize];
-        rays.push(&camera, &intrinsics, pixel_grid(PROOF_SIDE, PROOF_SIDE, 1), &mut random);
+        rays.push(&camera, &intrinsics, pixel_grid(proof::SIDE, proof::SIDE, 1), &mut random);
         let target_rgb = (0..3 * rays.z0.len()).map(|_| random.random_range(-1.0..1.0)).collect();
         TrainingBatch { instances: vec![number % model.layout.instances], rays, target_rgb }
     }
@@ -129,7 +128,7 @@ impl Trainer {
         model.hypernetwork()?;
         let work = if train == Train::Codes { "codes" } else { "all parameters" };
         engine.prove(work, |engine| {
-            let mut trainer = Self::unproven(engine, model.clone(), train, 1, PROOF_SIDE * PROOF_SIDE)?;
+            let mut trainer = Self::unproven(engine, model.clone(), train, 1, proof::SIDE * proof::SIDE)?;
             let few = |(_, values): (String, Vec<f32>)| {
                 let every = values.len().div_ceil(PROOF_VALUES).max(1);
                 values.into_iter().step_by(every).map(f64::from).collect()

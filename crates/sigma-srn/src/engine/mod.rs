@@ -11,7 +11,7 @@ use srn_plan::{Builder, Executor, ExecutorError, Plan, PlanError, Rows};
 use crate::Error;
 use proof::{Proofs, difference};
 
-mod proof;
+pub(crate) mod proof;
 
 /// Memory that a plan may take on the CPU where the user sets no budget, in bytes.
 const CPU_BUDGET: u64 = 2 << 30;
