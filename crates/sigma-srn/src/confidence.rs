@@ -7,6 +7,8 @@ use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::estimator::{Estimate, Ranked};
+use crate::model::{Metadata, Model};
+use crate::unseen::Unseen;
 
 /// A symmetric matrix over a motion, see [`motion`].
 pub type Matrix6 = [[f64; 6]; 6];
@@ -134,7 +136,51 @@ pub fn motion(from: &DMat4, to: &DMat4) -> [f64; 6] {
     [a, b, c, shift.x, shift.y, shift.z]
 }
 
+/// What a picture may leave unexplained where there is no calibration.
+const UNEXPLAINED: f64 = 0.25;
+/// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on (`docs/accuracy.md`).
+const UNSEEN_RIVAL: f64 = 0.3;
+
+/// The part of a picture `[height, width, 3]` that a view leaves unexplained: the sum of absolute differences, over that to a white picture, of
+/// the pixels that count (`weights`, `[height, width]`). 0: equal; 1: no better than nothing; not a number where one is in the view.
+pub fn unexplained(rgb: &[f32], weights: Option<&[f32]>, view: &[f32]) -> f64 {
+    let weight = |value: usize| weights.map_or(1.0, |weights| weights[value / 3]);
+    let sum = |difference: &dyn Fn(usize) -> f32| {
+        (0..rgb.len()).map(|value| f64::from(weight(value) * difference(value).abs())).sum::<f64>()
+    };
+    sum(&|value| rgb[value] - view[value].clamp(-1.0, 1.0)) / sum(&|value| rgb[value] - 1.0)
+}
+
+/// The doubt where more than `most` of a picture is [`unexplained`], also where that is no number.
+pub fn unexplained_doubt(unexplained: f64, most: f64) -> Option<Doubt> {
+    (unexplained.is_nan() || unexplained > most).then_some(Doubt::Unexplained)
+}
+
 impl Estimate {
+    /// Why it is not to be trusted, if it is not: an estimate for an instance of `model`, whose view from there leaves so much of
+    /// [`Estimate::target`] [`unexplained`]. Without a calibration a quarter may be.
+    pub fn doubt(&self, model: &Model, instance: u32, unexplained: f64) -> Option<Doubt> {
+        let picture = match &model.metadata.calibration {
+            Some(calibration) => {
+                calibration.doubt(&model.instance_name(instance), unexplained, self.rival().map(|(_, higher)| higher))
+            }
+            None => unexplained_doubt(unexplained, UNEXPLAINED),
+        };
+        self.doubt_besides(&model.metadata, picture)
+    }
+
+    /// The same, given what the picture says: the loss must be a number, and the object seen as the model knows it.
+    fn doubt_besides(&self, metadata: &Metadata, picture: Option<Doubt>) -> Option<Doubt> {
+        let is_unknown = !metadata.knows_distance(self.pose.distance());
+        let is_small = metadata.calibration.as_ref().is_some_and(|known| known.is_small(self.extent));
+        match picture {
+            _ if !self.loss.is_finite() => Some(Doubt::Loss),
+            None | Some(Doubt::Rival) if is_unknown => Some(Doubt::Distance),
+            None | Some(Doubt::Rival) if is_small => Some(Doubt::Small),
+            doubt => doubt,
+        }
+    }
+
     /// `loss · B⁻¹`, the shape of the estimate's errors. `None` without second derivatives, or where they are not those of a minimum.
     pub fn shape(&self) -> Option<Matrix6> {
         let lower = cholesky(self.curvature.as_ref()?)?;
@@ -166,6 +212,17 @@ impl Estimate {
         };
         let rival = self.ranking[1..].iter().find(is_elsewhere)?;
         Some((rival, rival.loss / self.loss - 1.0))
+    }
+}
+
+impl Unseen {
+    /// The same as [`Estimate::doubt`], for an object that `model` was not trained on: its code bends to the picture at a wrong pose too, so what
+    /// matters more than what is unexplained is whether the other known objects that it began with led to the same pose.
+    pub fn doubt(&self, model: &Model, unexplained: f64) -> Option<Doubt> {
+        let most = model.metadata.calibration.as_ref().map_or(UNEXPLAINED, |calibration| calibration.unexplained);
+        let has_rival = self.estimate.rival().is_some_and(|(_, higher)| higher < UNSEEN_RIVAL);
+        let picture = unexplained_doubt(unexplained, most).or(has_rival.then_some(Doubt::Rival));
+        self.estimate.doubt_besides(&model.metadata, picture)
     }
 }
 
@@ -483,5 +540,16 @@ mod tests {
         let estimate = estimate(look_at_origin(DVec3::new(1.0, -0.6, 0.5)));
         let (rival, higher) = estimate.rival().unwrap();
         assert_eq!((rival.start, higher), (5, 0.5));
+    }
+
+    #[test]
+    fn unexplained_is_relative_to_an_empty_picture() {
+        let picture = [0.5, 1.0, -0.5];
+        assert_eq!(unexplained(&picture, None, &picture), 0.0);
+        assert_eq!(unexplained(&picture, None, &[1.0, 1.7, 1.0]), 1.0);
+        assert_eq!(unexplained(&picture, None, &[0.5, 1.0, -1.5]), 0.25);
+        assert!(unexplained(&picture, None, &[0.5, f32::NAN, -0.5]).is_nan() && unexplained(&[1.0; 3], None, &[1.0; 3]).is_nan());
+        let two = [0.5, 1.0, -0.5, -1.0, -1.0, -1.0];
+        assert_eq!(unexplained(&two, Some(&[1.0, 0.0]), &[0.5, 1.0, -1.5, 1.0, 1.0, 1.0]), 0.25);
     }
 }

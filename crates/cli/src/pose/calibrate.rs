@@ -5,12 +5,12 @@ use std::path::PathBuf;
 
 use clap::Args;
 use glam::DMat4;
-use sigma_srn::confidence::{self, Matrix6, fit, motion};
+use sigma_srn::confidence::{self, Matrix6, fit, motion, unexplained};
 use sigma_srn::{Calibration, Effort, Options, Rendering, Seen};
 
 use super::files::Picture;
 use super::notation::Notation;
-use super::search::{Found, On, PoseError, SearchArgs, Starts, View, render, unexplained};
+use super::search::{Found, On, PoseError, SearchArgs, Starts, View, render};
 use super::views::{self, Views, spread};
 use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_to_write};
 

@@ -8,10 +8,10 @@ use clap::{Args, ValueEnum};
 use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
 use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
-use sigma_srn::confidence::deviations;
+use sigma_srn::confidence::{deviations, unexplained, unexplained_doubt};
 use sigma_srn::{
-    Calibration, Doubt, Effort, Engine, Error, Estimate, Intrinsics, Loss, Metadata, Method, Model, Options, Progress, Query,
-    Renderer, Rendering, Unseen, estimate, estimate_unseen,
+    Calibration, Doubt, Effort, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer,
+    Rendering, Unseen, estimate, estimate_unseen,
 };
 
 use super::files::Picture;
@@ -19,10 +19,6 @@ use super::notation::Notation;
 use super::positive;
 use crate::common::{EngineArgs, Result};
 
-/// What `--accept` is for a model without a calibration.
-const ACCEPT: f64 = 0.25;
-/// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on (`docs/accuracy.md`).
-const UNSEEN_RIVAL: f64 = 0.3;
 /// Views that are rendered at once.
 const RENDER_BATCH: usize = 8;
 
@@ -227,7 +223,11 @@ impl SearchArgs {
         let views: Vec<View> = pictures.iter().zip(&estimates).map(view).collect();
         let renders = render(on, &views)?;
         let found = estimates.into_iter().zip(renders).zip(pictures);
-        Ok(found.map(|((estimate, render), picture)| self.found(model, picture, estimate, render, seconds)).collect())
+        let found = found.map(|((estimate, render), picture)| {
+            let doubt = |estimate: &Estimate, unexplained| estimate.doubt(model, picture.instance, unexplained);
+            self.found(model, picture, estimate, render, seconds, doubt)
+        });
+        Ok(found.collect())
     }
 
     /// The same, and once more, exhaustively, where the normal effort has found nothing to be trusted. `observe` is also told how many searches
@@ -273,59 +273,37 @@ impl SearchArgs {
         let began = Instant::now();
         let query = query(picture, side, starts);
         // It has no calibration: the deviations that `calibrate` has found are those of known objects.
-        let Unseen { estimate, model: fitted, .. } = estimate_unseen(engine, model, &query, self.seed, observe)?;
+        let unseen = estimate_unseen(engine, model, &query, self.seed, observe)?;
         let seconds = began.elapsed().as_secs_f64();
-        let view = (0, estimate.pose.to_matrix(), picture.intrinsics);
-        let render = render(On { model: &fitted, ..on }, &[view])?.swap_remove(0);
-        let found = self.found(&fitted, picture, estimate, render, seconds);
-        Ok((Found { doubt: self.doubt_unseen(model, &found), ..found }, fitted))
+        let view = (0, unseen.estimate.pose.to_matrix(), picture.intrinsics);
+        let render = render(On { model: &unseen.model, ..on }, &[view])?.swap_remove(0);
+        let Unseen { ref estimate, model: ref fitted, .. } = unseen;
+        let doubt = |_: &Estimate, unexplained| unseen.doubt(model, unexplained);
+        let found = self.found(fitted, picture, estimate.clone(), render, seconds, doubt);
+        Ok((found, unseen.model))
     }
 
-    fn found(&self, model: &Model, picture: &Picture, estimate: Estimate, render: Rendering, seconds: f64) -> Found {
+    /// `doubt`: why it is not to be trusted with so much of the picture unexplained, unless `--accept` decides alone.
+    fn found(
+        &self,
+        model: &Model,
+        picture: &Picture,
+        estimate: Estimate,
+        render: Rendering,
+        seconds: f64,
+        doubt: impl FnOnce(&Estimate, f64) -> Option<Doubt>,
+    ) -> Found {
         let unexplained = unexplained(&estimate.target, picture.weights.as_deref(), &render.rgb);
-        let doubt = self.doubt(model, picture.instance, &estimate, unexplained);
+        let doubt = match self.accept {
+            Some(_) if !estimate.loss.is_finite() => Some(Doubt::Loss),
+            Some(most) => unexplained_doubt(unexplained, most),
+            None => doubt(&estimate, unexplained),
+        };
         let calibration = model.metadata.calibration.as_ref();
         let instance = model.instance_name(picture.instance);
         let confidence = calibration.and_then(|calibration| Confidence::of(&estimate, &instance, calibration));
         let world_from_camera = estimate.pose.to_matrix();
         Found { world_from_camera, estimate, rgb: render.rgb, unexplained, doubt, confidence, searches: 1, seconds }
-    }
-
-    /// Why an estimate is not to be trusted.
-    fn doubt(&self, model: &Model, instance: u32, estimate: &Estimate, unexplained: f64) -> Option<Doubt> {
-        self.doubt_with(model, estimate, |rival| match &model.metadata.calibration {
-            Some(calibration) if self.accept.is_none() => calibration.doubt(&model.instance_name(instance), unexplained, rival),
-            _ => unexplained_doubt(unexplained, self.accept.unwrap_or(ACCEPT)),
-        })
-    }
-
-    /// The same for an object that the model was not trained on: its code bends to the picture at a wrong pose too, so what matters more than
-    /// what is unexplained is whether the other known objects that it began with led to the same pose.
-    fn doubt_unseen(&self, model: &Model, found: &Found) -> Option<Doubt> {
-        self.doubt_with(model, &found.estimate, |rival| {
-            let learnt = model.metadata.calibration.as_ref().map(|calibration| calibration.unexplained);
-            let has_rival = self.accept.is_none() && rival.is_some_and(|higher| higher < UNSEEN_RIVAL);
-            unexplained_doubt(found.unexplained, self.accept.or(learnt).unwrap_or(ACCEPT)).or(has_rival.then_some(Doubt::Rival))
-        })
-    }
-
-    /// What every estimate must be, beside what `picture` says, which is told how much worse the rival is: a number, and seen from where the
-    /// model has learnt, unless `--accept` decides alone.
-    fn doubt_with(
-        &self,
-        model: &Model,
-        estimate: &Estimate,
-        picture: impl FnOnce(Option<f64>) -> Option<Doubt>,
-    ) -> Option<Doubt> {
-        let Metadata { calibration, .. } = &model.metadata;
-        let is_unknown = self.accept.is_none() && !model.metadata.knows_distance(estimate.pose.distance());
-        let is_small = self.accept.is_none() && calibration.as_ref().is_some_and(|known| known.is_small(estimate.extent));
-        match picture(estimate.rival().map(|(_, higher)| higher)) {
-            _ if !estimate.loss.is_finite() => Some(Doubt::Loss),
-            None | Some(Doubt::Rival) if is_unknown => Some(Doubt::Distance),
-            None | Some(Doubt::Rival) if is_small => Some(Doubt::Small),
-            doubt => doubt,
-        }
     }
 
     /// Starts all around the object, turned so that it appears in the middle of the picture: a cut may lie anywhere beside the
@@ -360,11 +338,6 @@ impl SearchArgs {
             Starts::File(path) => Ok(srn_data::srn::read_poses(path)?.into_iter().map(|pose| notation.ours(pose)).collect()),
         }
     }
-}
-
-/// The doubt where more than `most` of a picture is unexplained, also where that is no number.
-fn unexplained_doubt(unexplained: f64, most: f64) -> Option<Doubt> {
-    (unexplained.is_nan() || unexplained > most).then_some(Doubt::Unexplained)
 }
 
 fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
@@ -457,15 +430,6 @@ impl std::fmt::Display for PoseError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{:.2}° {:.3}", self.rotation_deg, self.translation)
     }
-}
-
-/// Sum of absolute differences to `render`, over that to a white picture; not a number if the render has one.
-pub fn unexplained(rgb: &[f32], weights: Option<&[f32]>, render: &[f32]) -> f64 {
-    let weight = |value: usize| weights.map_or(1.0, |weights| weights[value / 3]);
-    let sum = |difference: &dyn Fn(usize) -> f32| {
-        (0..rgb.len()).map(|value| f64::from(weight(value) * difference(value).abs())).sum::<f64>()
-    };
-    sum(&|value| rgb[value] - render[value].clamp(-1.0, 1.0)) / sum(&|value| rgb[value] - 1.0)
 }
 
 /// Instance, `world_from_camera` and intrinsics of a view.
@@ -568,16 +532,5 @@ mod tests {
         for plain in ["--effort fast", "--effort exhaustive", "--steps 9", "--no-cull", "--preset paper --steps 9"] {
             assert_eq!(searched(&format!("--accept 1e-9 {plain}")), [(0, 0), (0, 1)], "{plain}");
         }
-    }
-
-    #[test]
-    fn unexplained_is_relative_to_an_empty_picture() {
-        let picture = [0.5, 1.0, -0.5];
-        assert_eq!(unexplained(&picture, None, &picture), 0.0);
-        assert_eq!(unexplained(&picture, None, &[1.0, 1.7, 1.0]), 1.0);
-        assert_eq!(unexplained(&picture, None, &[0.5, 1.0, -1.5]), 0.25);
-        assert!(unexplained(&picture, None, &[0.5, f32::NAN, -0.5]).is_nan() && unexplained(&[1.0; 3], None, &[1.0; 3]).is_nan());
-        let two = [0.5, 1.0, -0.5, -1.0, -1.0, -1.0];
-        assert_eq!(unexplained(&two, Some(&[1.0, 0.0]), &[0.5, 1.0, -1.5, 1.0, 1.0, 1.0]), 0.25);
     }
 }
