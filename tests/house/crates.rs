@@ -12,6 +12,7 @@ const CRATES: &[(&str, &str, &[&str])] = &[
     ("crates/sigma-srn", "sigma-srn", &["srn-plan", "srn-cpu", "srn-gpu", "srn-shaders"]),
     // From the GPU crate only the rasteriser.
     ("crates/cli", "sigma-cli", &["sigma-srn", "srn-data", "srn-gpu"]),
+    ("crates/web", "sigma-web", &["sigma-srn"]),
     ("tests", "srn-tests", &["sigma-srn", "srn-data", "srn-plan", "srn-cpu", "srn-gpu", "srn-shaders"]),
     ("xtask", "xtask", &[]),
 ];

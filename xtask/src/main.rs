@@ -6,6 +6,7 @@ mod fuzz;
 mod new_op;
 mod setup;
 mod shell;
+mod web;
 
 use std::process::ExitCode;
 
@@ -23,6 +24,12 @@ const COMMANDS: &[Command] = &[
     Command { name: "lint", arguments: "", about: "formatting, clippy, documentation; warnings are errors", run: checks::lint },
     Command { name: "ci", arguments: "", about: "everything that CI checks, the cheapest first", run: checks::ci },
     Command { name: "setup", arguments: "", about: "what the tests need beside Rust: a Vulkan driver", run: setup::run },
+    Command {
+        name: "web",
+        arguments: "[--check]",
+        about: "the page with renderer and search, built for browsers and served",
+        run: web::run,
+    },
     Command {
         name: "golden",
         arguments: "DIR [--executor cpu64|cpu|gpu]",

@@ -19,7 +19,8 @@ const FILE: &str = "variants.txt";
 /// How the variants of kernels are chosen.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Choice {
-    /// The fastest one: measured when a plan first needs it, on buffers of the measurement's own, and kept.
+    /// The fastest one: measured when a plan first needs it, on buffers of the measurement's own, and kept. In a browser whose devices have no
+    /// timestamps, the plain form.
     ///
     /// Variants add in different orders, so results repeat bit for bit as long as the choice does. The file sees to that
     /// from one process to the next; without one, each device that is opened measures anew.
@@ -106,6 +107,7 @@ impl Chooser {
         let usable: Vec<&'static Variant> = step.kernel.variants.iter().filter(|variant| is_usable(variant, step, gpu)).collect();
         let variant = match &self.choice {
             _ if usable.len() == 1 => usable[0],
+            Choice::Measured { .. } if !gpu.can_time() => usable[0],
             Choice::Named(name) => usable.iter().find(|variant| variant.name.ends_with(name)).unwrap_or(&usable[0]),
             Choice::Measured { .. } => {
                 let texts: Vec<String> = usable.iter().map(|variant| gpu.source(step.kernel, variant)).collect();

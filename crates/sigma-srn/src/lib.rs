@@ -35,7 +35,9 @@ pub use model::{Block, Hypernetwork, Kind, Layout, Metadata, Model, ModelConfig,
 pub use random::{Random, stream};
 pub use rays::{Rays, pixel_grid};
 pub use renderer::{Renderer, Rendering};
-pub use srn_gpu::{AdapterInfo, Gpu, adapters, wgpu};
+#[cfg(not(target_family = "wasm"))]
+pub use srn_gpu::adapters;
+pub use srn_gpu::{AdapterInfo, Gpu, wgpu};
 pub use trainer::{Losses, Train, Trainer, TrainingBatch};
 pub use unseen::{Unseen, estimate_unseen};
 

@@ -1,16 +1,16 @@
 //! Where plans run: a GPU through wgpu, or the CPU.
 
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
-use std::time::Instant;
 
 use srn_cpu::Precision;
 use srn_gpu::{AdapterInfo, Gpu, GpuExecutor};
-use srn_plan::ops::linear::{self, Layer, Sets};
-use srn_plan::{Builder, Executor, ExecutorError, Plan, PlanError, Rows};
+use srn_plan::{Builder, Executor, ExecutorError, Plan, PlanError};
 
 use crate::Error;
 use proof::{Proofs, difference};
 
+#[cfg(not(target_family = "wasm"))]
+mod automatic;
 pub(crate) mod proof;
 
 /// Memory that a plan may take on the CPU where the user sets no budget, in bytes.
@@ -65,30 +65,6 @@ impl Engine {
         let budget = gpu.default_memory_budget();
         let cooperative = gpu.cooperative().map(|_| Arc::default());
         Engine { kind: Kind::Gpu(gpu), budget, tile_rows: None, cooperative, proofs: Arc::default() }
-    }
-
-    /// The GPU where there is an adapter that is not a software one, else whichever executor is faster on a small matrix
-    /// product on this machine. Also says which it took and why.
-    pub fn automatic() -> (Self, String) {
-        let gpu = match Gpu::open(None) {
-            Ok(gpu) => gpu,
-            Err(error) => return (Self::cpu(), format!("CPU executor: {error}")),
-        };
-        let name = gpu.adapter().name;
-        if !gpu.adapter().is_software {
-            return (Self::gpu(gpu), format!("GPU executor on {name}"));
-        }
-        let (cpu, software) = (Self::cpu(), Self::gpu(gpu));
-        match (cpu.matrix_product_seconds(), software.matrix_product_seconds()) {
-            (Ok(cpu_time), Ok(software_time)) if software_time < cpu_time => {
-                (software, format!("GPU executor on {name}: {:.1} times the CPU executor's speed here", cpu_time / software_time))
-            }
-            (Ok(cpu_time), Ok(software_time)) => {
-                (cpu, format!("CPU executor: {:.1} times the speed of {name} here", software_time / cpu_time))
-            }
-            (_, Err(error)) => (cpu, format!("CPU executor: {name} failed ({error})")),
-            (Err(_), _) => (software, format!("GPU executor on {name}")),
-        }
     }
 
     /// The same with another memory budget, in bytes.
@@ -216,30 +192,6 @@ impl Engine {
             Kind::Gpu(gpu) if self.is_cooperative() => Ok(Runner::Gpu(GpuExecutor::new(&self.believed(gpu), plan, self.budget)?)),
             _ => self.prepare(plan),
         }
-    }
-
-    /// Seconds of the best of three products of 4096 rows with 128 × 128 weights, after a first one that compiles.
-    fn matrix_product_seconds(&self) -> Result<f64, Error> {
-        const ROWS: u32 = 4096;
-        const WIDTH: u32 = 128;
-        let mut b = self.builder();
-        let weights = b.input("weights", (WIDTH * WIDTH + WIDTH) as usize)?;
-        let (x, y) = (b.input("x", (ROWS * WIDTH) as usize)?, b.scratch("y", (ROWS * WIDTH) as usize)?);
-        let slots = b.input_u32("slots", 1)?;
-        let layer = Layer { weights, in_features: WIDTH, out_features: WIDTH, sets: Sets::Shared };
-        let stage = b.stage("product");
-        linear::forward(&mut b, Rows::plain(ROWS), layer, x, slots, y, false)?;
-        let mut runner = self.prepare(b.finish()?)?;
-        let mut best = f64::INFINITY;
-        for round in 0..4 {
-            let start = Instant::now();
-            runner.run(stage)?;
-            runner.read(y)?;
-            if round > 0 {
-                best = best.min(start.elapsed().as_secs_f64());
-            }
-        }
-        Ok(best)
     }
 }
 
