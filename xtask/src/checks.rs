@@ -3,18 +3,12 @@
 use std::time::Instant;
 
 use crate::shell::{self, Count, cargo};
-use crate::{demo, setup, web};
+use crate::{demo, setup};
 
 /// Formatting, clippy and documentation.
 pub fn lint(_: &[String]) -> Result<(), String> {
     shell::run(cargo().args(["fmt", "--all", "--check"]))?;
     shell::run(cargo().args(["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"]))?;
-    if web::has_target() {
-        let browser = ["clippy", "--target", web::TARGET, "--package", "sigma-web", "--", "-D", "warnings"];
-        shell::run(cargo().args(browser))?;
-    } else {
-        println!("not checked for browsers: rustup target add {}", web::TARGET);
-    }
     let mut doc = cargo();
     doc.args(["doc", "--quiet", "--release", "--workspace", "--no-deps"]);
     shell::run(doc.env("RUSTDOCFLAGS", "-D warnings"))

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use crate::shell::{self, root};
 
-pub const TARGET: &str = "wasm32-unknown-unknown";
+const TARGET: &str = "wasm32-unknown-unknown";
 /// Everything that is served.
 const SITE: &str = "target/web";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -57,7 +57,7 @@ pub fn run(arguments: &[String]) -> Result<(), String> {
 }
 
 /// Whether code for browsers can be compiled here.
-pub fn has_target() -> bool {
+fn has_target() -> bool {
     let mut rustc = shell::program(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
     let output = rustc.args(["--print", "target-libdir", "--target", TARGET]).output();
     output.is_ok_and(|output| Path::new(String::from_utf8_lossy(&output.stdout).trim()).is_dir())

@@ -72,7 +72,8 @@ pub struct Gpu {
 
 impl Gpu {
     /// Uses the caller's device and queue, within that device's features and limits. In a browser, where results are waited for by suspending
-    /// WebAssembly, call what waits from exports with `#[wasm_bindgen(jspi)]`, one at a time.
+    /// WebAssembly, call what waits from exports with `#[wasm_bindgen(jspi)]`, one at a time. With [`Choice::Named`] nothing is measured, and nothing waits
+    /// but what reads.
     ///
     /// The caller's error handlers stay as they are: errors caused by calls of this crate are caught in error scopes.
     pub fn from_device(device: wgpu::Device, queue: wgpu::Queue) -> Gpu {

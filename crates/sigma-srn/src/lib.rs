@@ -37,7 +37,7 @@ pub use rays::{Rays, pixel_grid};
 pub use renderer::{Renderer, Rendering};
 #[cfg(not(target_family = "wasm"))]
 pub use srn_gpu::adapters;
-pub use srn_gpu::{AdapterInfo, Gpu, wgpu};
+pub use srn_gpu::{AdapterInfo, Choice, Gpu, wgpu};
 pub use trainer::{Losses, Train, Trainer, TrainingBatch};
 pub use unseen::{Unseen, estimate_unseen};
 

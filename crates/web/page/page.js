@@ -9,7 +9,7 @@ let session;
 let samples = [];
 /// The sample shown, if it is one; its pose is known.
 let sample;
-/// RGBA of the picture.
+/// RGBA of the picture, transparent where it was.
 let picture;
 /// The camera of the view: 4 × 4, row by row, world_from_camera.
 let camera;
@@ -50,8 +50,9 @@ function draw(id, rgba) {
 function show(view) {
   draw("view", view);
   if (!picture) return;
+  const onWhite = (k) => 255 - ((255 - picture[k]) * picture[k | 3]) / 255;
   // White where there is none.
-  const difference = view.map((value, k) => (k % 4 === 3 ? 255 : 255 - Math.min(255, 2 * Math.abs(value - picture[k]))));
+  const difference = view.map((value, k) => (k % 4 === 3 ? 255 : 255 - Math.min(255, 2 * Math.abs(value - onWhite(k)))));
   draw("difference", difference);
 }
 
@@ -92,8 +93,7 @@ async function choose(source, known) {
   const image = await createImageBitmap(source);
   const square = Math.min(image.width, image.height);
   const context = at("picture").getContext("2d", { willReadFrequently: true });
-  context.fillStyle = "white";
-  context.fillRect(0, 0, SIDE, SIDE);
+  context.clearRect(0, 0, SIDE, SIDE);
   context.imageSmoothingQuality = "high";
   context.drawImage(image, (image.width - square) / 2, (image.height - square) / 2, square, square, 0, 0, SIDE, SIDE);
   picture = context.getImageData(0, 0, SIDE, SIDE).data;

@@ -52,11 +52,12 @@ impl Session {
     /// A picture of `side` × `side` pixels, RGBA, from `world_from_camera` (4 × 4, row by row), with the focal length `focal` in pixels.
     #[wasm_bindgen(jspi)]
     pub fn render(&mut self, instance: u32, world_from_camera: &[f64], side: u32, focal: f64) -> Result<Vec<u8>, JsError> {
-        let camera = (pose(world_from_camera)?, intrinsics(side, focal));
+        let camera = (pose(world_from_camera)?, intrinsics(side, focal)?);
         Ok(to_rgba(&self.view(instance, camera, side)?))
     }
 
-    /// The pose of an object in a picture of `side` × `side` RGBA pixels, white where it is not, with the focal length `focal` in pixels.
+    /// The pose of an object in a picture of `side` × `side` RGBA pixels, white or transparent where it is not, with the focal length `focal` in pixels.
+    /// Light and outline of a cut out object, that is where anything is transparent, are made up for.
     /// `rough`: where the camera is within some 30° (4 × 4, row by row); if there is none, it is looked for all around.
     /// `observe` is called with steps done, steps in all, and the best loss so far; a promise that it gives is waited for.
     #[wasm_bindgen(jspi)]
@@ -70,14 +71,27 @@ impl Session {
         is_fast: bool,
         observe: &Function,
     ) -> Result<Found, JsError> {
-        let rgb: Vec<f32> = rgba.chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).map(from_byte).collect();
-        let intrinsics = intrinsics(side, focal);
+        let intrinsics = intrinsics(side, focal)?;
+        let coverage: Vec<f32> = rgba.chunks_exact(4).map(|pixel| f32::from(pixel[3]) / 255.0).collect();
+        // On white.
+        let colour = |value: u8, covered: f32| 1.0 - covered * (2.0 - f32::from(value) / 127.5);
+        let pixels = rgba.chunks_exact(4).zip(&coverage);
+        let rgb = pixels.flat_map(|(pixel, &covered)| [0, 1, 2].map(|k| colour(pixel[k], covered))).collect();
         let starts = match rough {
             Some(rough) => neighbor4(&pose(&rough)?),
             None => around84(self.distance()),
         };
-        let query =
-            Query { instance, rgb, weights: None, coverage: None, dilation: 0.0, width: side, height: side, intrinsics, starts };
+        let query = Query {
+            instance,
+            rgb,
+            weights: None,
+            coverage: coverage.iter().any(|&covered| covered < 1.0).then_some(coverage),
+            dilation: 0.0,
+            width: side,
+            height: side,
+            intrinsics,
+            starts,
+        };
         let options = Options::of(if is_fast { Effort::Fast } else { Effort::Normal });
         let estimates = estimate(&self.engine, &self.model, &[query], &options, |progress| {
             let losses = progress.descent.losses()?;
@@ -156,13 +170,12 @@ fn pose(world_from_camera: &[f64]) -> Result<DMat4, JsError> {
 }
 
 /// Those of a square picture, the principal point in its middle.
-fn intrinsics(side: u32, focal: f64) -> Intrinsics {
+fn intrinsics(side: u32, focal: f64) -> Result<Intrinsics, JsError> {
+    if !(f64::MIN_POSITIVE..f64::INFINITY).contains(&focal) {
+        return Err(JsError::new(&format!("a focal length of {focal} pixels")));
+    }
     let middle = f64::from(side) / 2.0;
-    Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.0 }
-}
-
-fn from_byte(value: u8) -> f32 {
-    f32::from(value) / 127.5 - 1.0
+    Ok(Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.0 })
 }
 
 fn to_rgba(rgb: &[f32]) -> Vec<u8> {
