@@ -104,6 +104,8 @@ async function choose(source, known) {
   }
   for (const thumbnail of at("samples").children) thumbnail.classList.toggle("chosen", thumbnail.dataset.image === known?.image);
   at("found").textContent = at("pose").textContent = "";
+  at("progress").value = 0;
+  say(known?.image ?? source.name);
   at("search").disabled = busy || !session;
   await look();
 }
@@ -153,12 +155,13 @@ async function open() {
     if (!wanted) throw error;
     session = await Session.open(model, false);
     at("executor").value = "cpu";
-    why = `no WebGPU here (${error.message ?? error}): `;
+    console.warn(error);
+    why = "no WebGPU here (the console says why)";
   }
   at("object").replaceChildren(...session.instances().map((name) => new Option(name)));
   if (object) at("object").value = object;
   camera ??= orbit(0.6, 0.5, session.distance());
-  say(`${why}ready on ${session.executor()}`);
+  at("where").textContent = why;
 }
 
 /// Dragging turns the camera about the object.
@@ -193,7 +196,10 @@ async function main() {
   }
   at("object").addEventListener("change", look);
   at("fov").addEventListener("change", look);
-  at("file").addEventListener("change", () => at("file").files[0] && choose(at("file").files[0]).catch((error) => say(String(error), "error")));
+  at("file").addEventListener("change", () => {
+    const [file] = at("file").files;
+    if (file) choose(file).catch((error) => say(`${file.name}: ${error.message}`, "error"));
+  });
   at("executor").addEventListener("change", () => open().then(look));
   at("search").addEventListener("click", () => {
     const around = document.querySelector("input[name=starts]:checked").value === "around";
