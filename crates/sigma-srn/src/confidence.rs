@@ -350,8 +350,9 @@ fn forward(lower: &Matrix6, mut x: [f64; 6]) -> [f64; 6] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::{Pose6, look_at_origin};
+    use crate::model::ModelConfig;
     use crate::random::{normal, stream};
-    use crate::{Pose6, camera::look_at_origin};
 
     /// A positive matrix with unlike scales.
     fn curvature() -> Matrix6 {
@@ -397,6 +398,47 @@ mod tests {
         assert_eq!(known.doubt("well", f64::NAN, Some(0.05)), Some(Doubt::Unexplained));
         let old = Calibration { at_truth: BTreeMap::new(), ..known };
         assert_eq!([0.8, 1.0].map(|part| old.doubt("well", part, None)), [None, Some(Doubt::Unexplained)]);
+    }
+
+    #[test]
+    fn a_pose_is_trusted_where_nothing_speaks_against_it() {
+        let config = ModelConfig { hidden: 4, latent: 2, instances: 1, tracing_steps: 1, density: true };
+        let plain = Model::init(&config, 0).unwrap();
+        let model = |calibration: Option<Calibration>| {
+            let metadata = Metadata { ray_sphere: Some(1.3), calibration, ..plain.metadata.clone() };
+            Model { metadata, ..plain.clone() }
+        };
+        let seen = Some(Seen { distance: 1.3, extent: 0.5 });
+        let calibrated = model(Some(Calibration { unexplained: 0.5, rival: 0.4, seen, ..calibration(1.0, [1.0; 6]) }));
+        let strict = model(Some(Calibration { unexplained: 0.5, rival: 0.6, seen, ..calibration(1.0, [1.0; 6]) }));
+        let at = |distance: f64| estimate(look_at_origin(DVec3::new(0.0, distance, 0.0)));
+        let small = Estimate { extent: 0.2, ..at(1.3) };
+        let broken = Estimate { loss: f64::INFINITY, ..at(1.3) };
+        // A rival's loss is half as much higher.
+        for (model, estimate, part, doubt) in [
+            (&calibrated, at(1.3), 0.4, None),
+            (&calibrated, at(1.3), 0.6, Some(Doubt::Unexplained)),
+            (&calibrated, at(0.6), 0.4, Some(Doubt::Distance)),
+            (&calibrated, at(0.6), 0.6, Some(Doubt::Unexplained)),
+            (&calibrated, small.clone(), 0.4, Some(Doubt::Small)),
+            (&calibrated, broken, 0.4, Some(Doubt::Loss)),
+            (&strict, at(1.3), 0.4, Some(Doubt::Rival)),
+            (&strict, small.clone(), 0.4, Some(Doubt::Small)),
+            (&model(None), at(1.3), 0.2, None),
+            (&model(None), small, 0.2, None),
+            (&model(None), at(1.3), 0.3, Some(Doubt::Unexplained)),
+            (&model(None), at(0.6), 0.2, Some(Doubt::Distance)),
+        ] {
+            assert_eq!(estimate.doubt(model, 0, part), doubt, "{part} {:?}", estimate.pose);
+        }
+        // Of an object that the model does not know other limits hold.
+        let unseen = |higher: f64| {
+            let mut estimate = at(1.3);
+            estimate.ranking[2].loss = (1.0 + higher) * estimate.loss;
+            Unseen { estimate, model: plain.clone(), nearest: 0 }
+        };
+        assert_eq!([0.2, 0.4].map(|higher| unseen(higher).doubt(&strict, 0.4)), [Some(Doubt::Rival), None]);
+        assert_eq!([&strict, &model(None)].map(|model| unseen(0.4).doubt(model, 0.4)), [None, Some(Doubt::Unexplained)]);
     }
 
     /// Where a picture shows the object smaller than those of the calibration, all errors grow; where it is farther away, that along the view.
