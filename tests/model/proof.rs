@@ -48,11 +48,29 @@ fn an_adapter_that_computes_nothing_is_refused() {
     let error = found(&engine).unwrap_err();
     assert!(matches!(&error, Error::Adapter { difference, .. } if *difference > 0.9), "{error}");
     let message = error.to_string();
+    let [width, height] = SIZE;
+    let error = Renderer::new(&engine, &model(true), 1, width, height).err().expect("refused");
+    assert!(matches!(&error, Error::Adapter { work: "views", .. }), "{error}");
     assert!(message.contains(&gpu().adapter().name) && message.contains("gradients of poses"), "{message}");
     for train in [Train::Codes, Train::Everything] {
         let error = trained(&engine, model(true), train).err().expect("refused");
         assert!(matches!(error, Error::Adapter { .. }), "{error}");
     }
+}
+
+#[test]
+fn the_cpu_goes_on_where_it_may() {
+    let engine = Engine::gpu(faulty(|_| true, does_nothing)).or_cpu();
+    assert!(engine.as_gpu().is_some());
+    assert_eq!(found(&engine).unwrap(), found(&Engine::cpu()).unwrap());
+    assert!(engine.as_gpu().is_none() && engine.to_string() == "cpu");
+    let shown = |engine: &Engine| {
+        let view = [(camera::fixed24(1.3)[2], intrinsics())];
+        Renderer::new(engine, &model(true), 1, SIZE[0], SIZE[1]).unwrap().render(&[0], &view, 0).unwrap()
+    };
+    assert_eq!(shown(&engine), shown(&Engine::cpu()));
+    assert_eq!(shown(&Engine::gpu(faulty(|_| true, does_nothing)).or_cpu()), shown(&Engine::cpu()), "views first");
+    trained(&engine, model(true), Train::Everything).unwrap();
 }
 
 #[test]

@@ -69,7 +69,7 @@ pub enum Error {
     },
     /// A GPU whose results are wrong.
     #[error(
-        "adapter `{adapter}` computes wrong results: gradients of {work} differ by {difference:.1e} of the largest from those of the CPU \
+        "adapter `{adapter}` computes wrong results: {work} differ by {difference:.1e} of the largest from those of the CPU \
          executor, also with the plain form of every kernel; try another driver, another adapter, or the CPU executor"
     )]
     Adapter {

@@ -272,7 +272,7 @@ pub fn estimate(
         descent.evaluate()?;
         descent.gradients()
     };
-    engine.prove("poses", |engine| {
+    engine.prove("gradients of poses", |engine| {
         // As many of them from one start alone.
         let around = |h: &Hypothesis| {
             let at = |matrix: DMat4| Hypothesis { pose: Pose6::from_matrix(&matrix), ..*h };

@@ -5,8 +5,8 @@ use srn_gpu::wgpu;
 use srn_plan::ops::pack_rgba8;
 use srn_plan::{BufferId, Builder, PlanError, StageId, tiles};
 
-use crate::camera::Intrinsics;
-use crate::engine::{Engine, Runner};
+use crate::camera::{Intrinsics, fixed24};
+use crate::engine::{Engine, Runner, proof};
 use crate::model::Model;
 use crate::network::forward::{self, Instances};
 use crate::network::streamed::OnHost;
@@ -45,12 +45,30 @@ pub struct Renderer {
 
 impl Renderer {
     /// A renderer of `views` images of `width` × `height` pixels.
+    ///
+    /// A GPU that has rendered nothing before is compared with the CPU executor first, and refused where its views are wrong ([`Error::Adapter`]).
     pub fn new(engine: &Engine, model: &Model, views: u32, width: u32, height: u32) -> Result<Self, Error> {
         for (field, value) in [("views", views), ("width", width), ("height", height)] {
             if value == 0 {
                 return Err(Error::Setting { field, what: "must be at least 1".into() });
             }
         }
+        engine.prove("views", |engine| {
+            const TRIED: usize = 3;
+            let (side, middle) = (proof::SIDE, f64::from(proof::SIDE) / 2.0);
+            let intrinsics = Intrinsics { fx: f64::from(side), fy: f64::from(side), cx: middle, cy: middle, pixel_center: 0.0 };
+            let around = fixed24(model.metadata.orbit_radius.unwrap_or(1.3));
+            let cameras: Vec<_> = around.into_iter().step_by(9).map(|camera| (camera, intrinsics)).collect();
+            let mut renderer = Self::unproven(engine, model, TRIED as u32, side, side)?;
+            let Rendering { rgb, depth } = renderer.render(&[0; TRIED], &cameras[..TRIED], 0)?;
+            let parts = rgb.chunks(rgb.len() / TRIED).zip(depth.chunks(depth.len() / TRIED));
+            let wide = |part: &[f32]| part.iter().copied().map(f64::from).collect();
+            Ok(parts.map(|(rgb, depth)| vec![wide(rgb), wide(depth)]).collect())
+        })?;
+        Self::unproven(engine, model, views, width, height)
+    }
+
+    fn unproven(engine: &Engine, model: &Model, views: u32, width: u32, height: u32) -> Result<Self, Error> {
         let rays = width * height;
         let size = [width, height];
         let on_host = OnHost::of(engine, model, 1);

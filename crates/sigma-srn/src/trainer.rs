@@ -126,7 +126,7 @@ impl Trainer {
             }
         }
         model.hypernetwork()?;
-        let work = if train == Train::Codes { "codes" } else { "all parameters" };
+        let work = if train == Train::Codes { "gradients of codes" } else { "gradients of all parameters" };
         engine.prove(work, |engine| {
             let mut trainer = Self::unproven(engine, model.clone(), train, 1, proof::SIDE * proof::SIDE)?;
             let few = |(_, values): (String, Vec<f32>)| {

@@ -30,7 +30,7 @@ impl Session {
     /// From the bytes of a model's file; `on_gpu`: on the browser's GPU, else on one thread of the CPU.
     pub async fn open(model: Vec<u8>, on_gpu: bool) -> Result<Session, JsError> {
         let model = Model::from_bytes(&model, "", Path::new("model"))?;
-        let engine = if on_gpu { Engine::gpu(open_gpu().await?) } else { Engine::cpu() };
+        let engine = if on_gpu { Engine::gpu(open_gpu().await?).or_cpu() } else { Engine::cpu() };
         Ok(Session { engine, model, renderer: None })
     }
 

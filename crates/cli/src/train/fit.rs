@@ -77,7 +77,6 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     let validation = settings.validation.as_ref().map(|dir| load(dir, settings.side, None)).transpose()?;
     let watched = watched_views(&set, validation.as_ref(), settings.validation_views as usize)?;
     let engine = if is_resumed { args.engine.open_like(&settings.executor, settings.memory)? } else { args.engine.open()? };
-    (settings.executor, settings.memory) = (engine.to_string(), engine.budget());
 
     let instance_names: Vec<String> = set.instances.iter().map(|instance| instance.name.clone()).collect();
     let checkpoint = run.join("checkpoint.safetensors");
@@ -112,6 +111,8 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         return Err(format!("--steps {}: the run has done {} already", settings.steps, trainer.steps()).into());
     }
     fs::create_dir_all(run).map_err(|error| format!("{}: {error}", run.display()))?;
+    // Now that it is known whether a GPU is believed.
+    (settings.executor, settings.memory) = (engine.to_string(), engine.budget());
     settings.write(run)?;
     let samples = run.join("samples");
     fs::create_dir_all(&samples).map_err(|error| format!("{}: {error}", samples.display()))?;

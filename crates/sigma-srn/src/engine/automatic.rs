@@ -11,7 +11,7 @@ use crate::Error;
 
 impl Engine {
     /// The GPU where there is an adapter that is not a software one, else whichever executor is faster on a small matrix
-    /// product on this machine. Also says which it took and why.
+    /// product on this machine. Also says which it took and why. [`Engine::or_cpu`].
     pub fn automatic() -> (Self, String) {
         let gpu = match Gpu::open(None) {
             Ok(gpu) => gpu,
@@ -19,9 +19,9 @@ impl Engine {
         };
         let name = gpu.adapter().name;
         if !gpu.adapter().is_software {
-            return (Self::gpu(gpu), format!("GPU executor on {name}"));
+            return (Self::gpu(gpu).or_cpu(), format!("GPU executor on {name}"));
         }
-        let (cpu, software) = (Self::cpu(), Self::gpu(gpu));
+        let (cpu, software) = (Self::cpu(), Self::gpu(gpu).or_cpu());
         match (cpu.matrix_product_seconds(), software.matrix_product_seconds()) {
             (Ok(cpu_time), Ok(software_time)) if software_time < cpu_time => {
                 (software, format!("GPU executor on {name}: {:.1} times the CPU executor's speed here", cpu_time / software_time))

@@ -42,6 +42,8 @@ pub struct Engine {
     tile_rows: Option<u32>,
     /// Where cooperative matrices are wanted: the difference that they were found to make, see [`Engine::cooperative_difference`].
     cooperative: Option<Arc<OnceLock<f64>>>,
+    /// Whether the CPU computes where the GPU is refused.
+    or_cpu: bool,
     proofs: Arc<Mutex<Proofs>>,
 }
 
@@ -49,7 +51,7 @@ impl Engine {
     /// The CPU in `f32`, with all threads of the current rayon pool.
     pub fn cpu() -> Self {
         let kind = Kind::Cpu(Precision::F32);
-        Engine { kind, budget: CPU_BUDGET, tile_rows: None, cooperative: None, proofs: Arc::default() }
+        Engine { kind, budget: CPU_BUDGET, tile_rows: None, cooperative: None, or_cpu: false, proofs: Arc::default() }
     }
 
     /// The CPU in `f64`: the oracle of the tests.
@@ -64,7 +66,18 @@ impl Engine {
     pub fn gpu(gpu: Gpu) -> Self {
         let budget = gpu.default_memory_budget();
         let cooperative = gpu.cooperative().map(|_| Arc::default());
-        Engine { kind: Kind::Gpu(gpu), budget, tile_rows: None, cooperative, proofs: Arc::default() }
+        Engine { kind: Kind::Gpu(gpu), budget, tile_rows: None, cooperative, or_cpu: false, proofs: Arc::default() }
+    }
+
+    /// The same, but a GPU that computes wrong results is not an error ([`Error::Adapter`]): the CPU goes on in its place, with a warning.
+    pub fn or_cpu(self) -> Self {
+        Engine { or_cpu: true, ..self }
+    }
+
+    /// What computes, by what is known of it now.
+    fn kind(&self) -> Kind {
+        let proofs = self.proofs.lock().unwrap_or_else(PoisonError::into_inner);
+        proofs.instead.as_ref().unwrap_or(&self.kind).clone()
     }
 
     /// The same with another memory budget, in bytes.
@@ -104,8 +117,8 @@ impl Engine {
     }
 
     /// The GPU, if it is one.
-    pub fn as_gpu(&self) -> Option<&Gpu> {
-        match &self.kind {
+    pub fn as_gpu(&self) -> Option<Gpu> {
+        match self.kind() {
             Kind::Gpu(gpu) => Some(gpu),
             Kind::Cpu(_) => None,
         }
@@ -113,7 +126,7 @@ impl Engine {
 
     /// Most bytes of one buffer, four to a value.
     pub(crate) fn max_binding_bytes(&self) -> u64 {
-        match &self.kind {
+        match self.kind() {
             Kind::Gpu(gpu) => gpu.max_binding_bytes(),
             Kind::Cpu(_) => u64::MAX,
         }
@@ -121,7 +134,7 @@ impl Engine {
 
     /// Bytes that a value of a plan takes.
     pub(crate) fn value_bytes(&self) -> u64 {
-        if matches!(self.kind, Kind::Cpu(Precision::F64)) { 8 } else { 4 }
+        if matches!(self.kind(), Kind::Cpu(Precision::F64)) { 8 } else { 4 }
     }
 
     /// A builder with this engine's limits.
@@ -137,7 +150,7 @@ impl Engine {
         features: u32,
         build: impl Fn(&mut Builder, u32) -> Result<T, PlanError>,
     ) -> Result<(Plan, T), Error> {
-        let preferred = self.tile_rows.unwrap_or(match &self.kind {
+        let preferred = self.tile_rows.unwrap_or(match self.kind() {
             Kind::Gpu(gpu) if gpu.adapter().is_software => SOFTWARE_TILE_ROWS,
             Kind::Gpu(_) => GPU_TILE_ROWS,
             // What is kept for the way back stays in the caches.
@@ -162,7 +175,7 @@ impl Engine {
 
     /// Rows of a tile of `tile_rows` over which one sum for the gradients of weights goes, at most, for a network of `features` wide layers.
     pub(crate) fn part_rows(&self, tile_rows: u32, features: u32) -> u32 {
-        match self.kind {
+        match self.kind() {
             Kind::Gpu(_) => GPU_PART_ROWS,
             Kind::Cpu(_) => srn_cpu::part_rows(tile_rows as usize, features as usize) as u32,
         }
@@ -174,22 +187,16 @@ impl Engine {
 
     /// Makes a plan ready to run.
     pub(crate) fn prepare(&self, plan: Plan) -> Result<Runner, ExecutorError> {
-        Ok(match &self.kind {
-            Kind::Cpu(precision) => Runner::Cpu(srn_cpu::executor(*precision, plan, self.budget)?),
-            Kind::Gpu(gpu) => Runner::Gpu(GpuExecutor::new(&self.believed(gpu).without_cooperative(), plan, self.budget)?),
+        Ok(match self.kind() {
+            Kind::Cpu(precision) => Runner::Cpu(srn_cpu::executor(precision, plan, self.budget)?),
+            Kind::Gpu(gpu) => Runner::Gpu(GpuExecutor::new(&gpu.without_cooperative(), plan, self.budget)?),
         })
-    }
-
-    /// The device, with the forms of kernels that are known to be right on it.
-    fn believed(&self, gpu: &Gpu) -> Gpu {
-        let proofs = self.proofs.lock().unwrap_or_else(PoisonError::into_inner);
-        proofs.plain.as_ref().unwrap_or(gpu).clone()
     }
 
     /// The same for one that looks for poses.
     pub(crate) fn prepare_descent(&self, plan: Plan) -> Result<Runner, ExecutorError> {
-        match &self.kind {
-            Kind::Gpu(gpu) if self.is_cooperative() => Ok(Runner::Gpu(GpuExecutor::new(&self.believed(gpu), plan, self.budget)?)),
+        match self.kind() {
+            Kind::Gpu(gpu) if self.is_cooperative() => Ok(Runner::Gpu(GpuExecutor::new(&gpu, plan, self.budget)?)),
             _ => self.prepare(plan),
         }
     }
@@ -197,7 +204,7 @@ impl Engine {
 
 impl std::fmt::Display for Engine {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match &self.kind {
+        match self.kind() {
             Kind::Cpu(Precision::F32) => write!(f, "cpu"),
             Kind::Cpu(Precision::F64) => write!(f, "cpu64"),
             Kind::Gpu(gpu) => {

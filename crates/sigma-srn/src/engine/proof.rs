@@ -1,18 +1,19 @@
 //! Whether a GPU computes what it should.
 //!
 //! Drivers have compiled kernels wrongly, and an adapter may compute nothing at all, without any error: a pose is found all the same,
-//! and it is anything. So a GPU is believed once its gradients, which need all kernels of their kind of work but those that take the step,
-//! are those of the CPU executor.
+//! and it is anything. So a GPU is believed once its views and its gradients, which need all kernels of their kind of work but those that take the
+//! step, are those of the CPU executor.
 
 use std::iter::zip;
 use std::sync::PoisonError;
 
+use srn_cpu::Precision;
 use srn_gpu::{Choice, Gpu};
 
-use super::Engine;
+use super::{Engine, Kind};
 use crate::Error;
 
-/// Most difference from the CPU executor's gradients, relative to the largest, in the median of the trials: in one of twenty a single ray makes rounding as
+/// Most difference from the CPU executor's results, relative to the largest, in the median of the trials: in one of twenty a single ray makes rounding as
 /// large as a hundredth; a wrong kernel is wrong in all.
 const LIMIT: f64 = 0.01;
 
@@ -26,7 +27,7 @@ pub(crate) const SIDE: u32 = 16;
 const AGREES: &str = "agrees";
 const AGREES_PLAIN: &str = "agrees/plain";
 
-/// Gradients of one trial, in parts of like numbers: tensors, say.
+/// Results of one trial, in parts of like numbers: tensors, say.
 pub(crate) type Trial = Vec<Vec<f64>>;
 
 /// What was found of a GPU.
@@ -34,20 +35,23 @@ pub(crate) type Trial = Vec<Vec<f64>>;
 pub(super) struct Proofs {
     /// Kinds of work that it does as the CPU does.
     works: Vec<&'static str>,
-    /// The same device with the plain forms of kernels, if others are wrong.
-    pub plain: Option<Gpu>,
+    /// What computes in its place: the same device with the plain forms of kernels, if others are wrong, or the CPU.
+    pub instead: Option<Kind>,
 }
 
 impl Engine {
     /// Compares some trials of a kind of work with the CPU executor's. Where only the plain forms of kernels agree the engine goes on with those; where
-    /// they do not, it fails. Done once for a device, its driver and the kernels' texts: the answer is kept where choices of variants are.
+    /// they do not, it fails, or goes on with the CPU ([`Engine::or_cpu`]). Done once for a device, its driver and the kernels' texts: the answer is kept where choices of variants are.
     ///
     /// Not where forms are [named](Choice::Named): whoever names one wants to see what it does.
     pub(crate) fn prove(&self, work: &'static str, trials: impl Fn(&Engine) -> Result<Vec<Trial>, Error>) -> Result<(), Error> {
-        let Some(gpu) = self.as_gpu().filter(|gpu| matches!(gpu.choice(), Choice::Measured { .. })) else { return Ok(()) };
+        let Kind::Gpu(gpu) = &self.kind else { return Ok(()) };
+        if matches!(gpu.choice(), Choice::Named(_)) {
+            return Ok(());
+        }
         // Held to the end: who comes meanwhile waits for the answer.
         let mut proofs = self.proofs.lock().unwrap_or_else(PoisonError::into_inner);
-        if proofs.works.contains(&work) {
+        if proofs.works.contains(&work) || matches!(proofs.instead, Some(Kind::Cpu(_))) {
             return Ok(());
         }
         let plain = gpu.with_choice(Choice::Named("plain".into())).without_cooperative();
@@ -66,6 +70,11 @@ impl Engine {
                 tracing::debug!(work, "the GPU's results differ from the CPU executor's by {fast:.1e} of the largest");
                 if fast > LIMIT {
                     let difference = off(&plain)?;
+                    if difference > LIMIT && self.or_cpu {
+                        tracing::warn!("{} computes wrong results, so the CPU does", gpu.adapter());
+                        proofs.instead = Some(Kind::Cpu(Precision::F32));
+                        return Ok(());
+                    }
                     if difference > LIMIT {
                         return Err(Error::Adapter { adapter: gpu.adapter().to_string(), work, difference });
                     }
@@ -74,9 +83,9 @@ impl Engine {
                 fast > LIMIT
             }
         };
-        if is_plain && proofs.plain.is_none() {
+        if is_plain && proofs.instead.is_none() {
             tracing::warn!("{} computes wrong results with the fast forms of kernels; the plain ones are used", gpu.adapter());
-            proofs.plain = Some(plain);
+            proofs.instead = Some(Kind::Gpu(plain));
         }
         proofs.works.push(work);
         Ok(())
