@@ -26,7 +26,7 @@ const COMMANDS: &[Command] = &[
     Command { name: "setup", arguments: "", about: "what the tests need beside Rust: a Vulkan driver", run: setup::run },
     Command {
         name: "web",
-        arguments: "[--check]",
+        arguments: "[MODEL | --check]",
         about: "the page with renderer and search, built for browsers and served",
         run: web::run,
     },

@@ -35,12 +35,13 @@ const PATIENCE: Duration = Duration::from_secs(600);
 const MOST_DEG: f64 = 1.0;
 
 pub fn run(arguments: &[String]) -> Result<(), String> {
-    let is_check = match arguments {
-        [] => false,
-        [flag] if flag == "--check" => true,
-        _ => return Err(format!("expected nothing or --check, got {}", arguments.join(" "))),
+    let (is_check, model) = match arguments {
+        [] => (false, MODEL),
+        [flag] if flag == "--check" => (true, MODEL),
+        [model] if root().join(model).is_file() => (false, model.as_str()),
+        _ => return Err(format!("expected nothing, --check or a model's file, got {}", arguments.join(" "))),
     };
-    build()?;
+    build(model)?;
     let listener = TcpListener::bind(ADDRESS).map_err(|error| format!("{ADDRESS}: {error}"))?;
     let (sender, reports) = mpsc::channel();
     let server = std::thread::spawn(move || {
@@ -63,7 +64,7 @@ fn has_target() -> bool {
     output.is_ok_and(|output| Path::new(String::from_utf8_lossy(&output.stdout).trim()).is_dir())
 }
 
-fn build() -> Result<(), String> {
+fn build(model: &str) -> Result<(), String> {
     if !has_target() {
         shell::run(shell::program("rustup").args(["target", "add", TARGET]))?;
     }
@@ -76,7 +77,7 @@ fn build() -> Result<(), String> {
     glue.args(["--target", "web", "--no-typescript", "--out-dir", SITE]);
     shell::run(glue.arg(format!("target/{TARGET}/release/sigma_web.wasm")))?;
     for (from, to) in
-        [("crates/web/page/index.html", "index.html"), ("crates/web/page/page.js", "page.js"), (MODEL, "model.safetensors")]
+        [("crates/web/page/index.html", "index.html"), ("crates/web/page/page.js", "page.js"), (model, "model.safetensors")]
     {
         copy(from, to)?;
     }

@@ -185,9 +185,9 @@ function drag() {
 async function main() {
   if (!("Suspending" in WebAssembly)) throw new Error("this browser cannot suspend WebAssembly (JSPI: Chrome and Edge 137, Firefox 153)");
   const [known] = await Promise.all([fetch("samples.json").then((answer) => answer.json()), init()]);
-  samples = known;
-  at("fov").value = samples[0].fov.toFixed(1);
+  at("fov").value = known[0].fov.toFixed(1);
   await open();
+  samples = known.filter((sample) => session.instances().includes(sample.object));
   for (const sample of samples) {
     const thumbnail = Object.assign(new Image(), { src: sample.image, title: sample.image });
     thumbnail.dataset.image = sample.image;
@@ -206,7 +206,8 @@ async function main() {
     search(around ? undefined : camera);
   });
   drag();
-  await chooseSample(samples[0]);
+  say("choose a picture");
+  await (samples.length ? chooseSample(samples[0]) : look());
 }
 
 /// For `cargo xtask web --check`: a search from 30° beside each sample's pose, told to whoever serves the page.
