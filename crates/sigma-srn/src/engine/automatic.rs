@@ -11,7 +11,7 @@ use crate::Error;
 
 impl Engine {
     /// The GPU where there is an adapter that is not a software one, else whichever executor is faster on a small matrix
-    /// product on this machine. Also says which it took and why. [`Engine::or_cpu`].
+    /// product on this machine. Also says which it took and why. Where a GPU is refused later, the CPU goes on ([`Engine::or_cpu`]).
     pub fn automatic() -> (Self, String) {
         let gpu = match Gpu::open(None) {
             Ok(gpu) => gpu,
