@@ -152,7 +152,7 @@ fn poses_near_the_truth_come_nearer() {
 }
 
 /// The shipped model, an object of it, and a lens for pictures of 28 × 28 pixels.
-fn shipped_forklift() -> (Model, u32, Intrinsics) {
+pub fn shipped_forklift() -> (Model, u32, Intrinsics) {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../assets/models/compact.safetensors");
     let model = Model::load(path.as_ref()).unwrap();
     let instance = model.instance("forklift").unwrap();
@@ -213,6 +213,21 @@ fn light_is_made_up_for() {
     assert!(wrong(vec![f32::NAN; 784]).contains("from 0 to 1"));
 }
 
+/// A view of `side` × `side` pixels as a careless hand cuts it out, and what it takes for the object: a rim of one pixel of something else, too.
+pub fn with_rim(view: &[f32], side: usize) -> (Vec<f32>, Vec<f32>) {
+    let is_object = |pixel: usize| view[3 * pixel..][..3].iter().any(|colour| *colour < 0.9);
+    let around =
+        |pixel: usize| [0, 1, side, 2 * side + 1].map(|d| pixel.wrapping_sub(d)).into_iter().chain([pixel + 1, pixel + side]);
+    let is_in_mask = |pixel: usize| around(pixel).any(|beside| beside < side * side && is_object(beside));
+    let coverage: Vec<f32> = (0..side * side).map(|pixel| f32::from(u8::from(is_in_mask(pixel)))).collect();
+    let colour = |value: usize| match (is_object(value / 3), is_in_mask(value / 3)) {
+        (true, _) => view[value].clamp(-1.0, 1.0),
+        (_, true) => [0.0, -0.2, -0.5][value % 3],
+        _ => 1.0,
+    };
+    ((0..3 * side * side).map(colour).collect(), coverage)
+}
+
 /// Where the coverage is known, dilations of it are tried; another picture beside it, or hypotheses that wait, are none the worse for it.
 #[test]
 fn masks_are_tried_dilated() {
@@ -221,19 +236,8 @@ fn masks_are_tried_dilated() {
     for engine in engines() {
         let truth = camera::fixed24(1.3)[2];
         let shown = Renderer::new(&engine, model, 1, SIDE, SIDE).unwrap().render(&[instance], &[(truth, intrinsics)], 0).unwrap();
-        let is_object = |pixel: usize| shown.rgb[3 * pixel..][..3].iter().any(|colour| *colour < 0.9);
         let side = SIDE as usize;
-        // A rim of one pixel is taken for the object.
-        let around =
-            |pixel: usize| [0, 1, side, 2 * side + 1].map(|d| pixel.wrapping_sub(d)).into_iter().chain([pixel + 1, pixel + side]);
-        let is_in_mask = |pixel: usize| around(pixel).any(|beside| beside < side * side && is_object(beside));
-        let coverage: Vec<f32> = (0..side * side).map(|pixel| f32::from(u8::from(is_in_mask(pixel)))).collect();
-        let colour = |value: usize| match (is_object(value / 3), is_in_mask(value / 3)) {
-            (true, _) => shown.rgb[value].clamp(-1.0, 1.0),
-            (_, true) => [0.0, -0.2, -0.5][value % 3],
-            _ => 1.0,
-        };
-        let rgb: Vec<f32> = (0..3 * side * side).map(colour).collect();
+        let (rgb, coverage) = with_rim(&shown.rgb, side);
         let query = |coverage: Option<&Vec<f32>>| {
             let (rgb, coverage, starts) = (rgb.clone(), coverage.cloned(), vec![camera::fixed24(1.3)[10], truth]);
             Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }

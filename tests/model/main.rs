@@ -15,6 +15,7 @@ mod lockstep;
 mod proof;
 mod streamed;
 mod tiles;
+mod tracker;
 
 const SIZE: [u32; 2] = [9, 7];
 const RAYS: u32 = SIZE[0] * SIZE[1];

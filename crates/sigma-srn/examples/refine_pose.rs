@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use sigma_srn::{Engine, Intrinsics, Model, Options, Query, Renderer, camera, estimate};
+use sigma_srn::{Engine, Intrinsics, Model, Query, Renderer, Search, camera};
 
 fn main() -> Result<(), sigma_srn::Error> {
     let path = std::env::args().nth(1).unwrap_or_else(|| "assets/models/compact.safetensors".into());
@@ -12,7 +12,7 @@ fn main() -> Result<(), sigma_srn::Error> {
     let (engine, why) = Engine::automatic();
     println!("{why}");
 
-    // The "photograph": a render from a pose that the estimator does not know.
+    // The "photograph": a render from a pose that the search does not know.
     const SIDE: u32 = 64;
     let intrinsics = Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.0 };
     let truth = camera::fixed24(model.metadata.orbit_radius.unwrap_or(1.3))[3];
@@ -29,14 +29,14 @@ fn main() -> Result<(), sigma_srn::Error> {
         intrinsics,
         starts: camera::neighbor4(&truth),
     };
-    let estimates = estimate(&engine, &model, &[query], &Options::default(), |progress| {
-        if progress.step % 50 == 0 {
+    let found = Search::default().run(&engine, &model, &[query], |progress| {
+        if progress.step % 10 == 0 {
             println!("step {} of {}: {} hypotheses", progress.step, progress.steps, progress.hypotheses.len());
         }
         Ok(())
     })?;
-    let (rotation, translation) = camera::pose_error(&estimates[0].pose.to_matrix(), &truth);
-    println!("start {} won with a loss of {:.4}", estimates[0].ranking[0].start, estimates[0].loss);
+    let (rotation, translation) = camera::pose_error(&found[0].world_from_camera, &truth);
+    println!("start {} won with a loss of {:.4}", found[0].estimate.ranking[0].start, found[0].estimate.loss);
     println!("error: {rotation:.2}° and {translation:.3} object units");
     Ok(())
 }

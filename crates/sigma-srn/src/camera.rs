@@ -22,6 +22,15 @@ impl Intrinsics {
     pub fn to_array(&self) -> [f32; 4] {
         [self.fx, self.fy, self.cx, self.cy].map(|value| value as f32)
     }
+
+    /// Cameras that look at the object's centre, turned so that it appears in the middle of a picture of `[width, height]` pixels: the
+    /// principal point of one that was cut out may lie anywhere beside it.
+    pub fn centred(&self, size: [u32; 2], cameras: Vec<DMat4>) -> Vec<DMat4> {
+        let [x, y] = size.map(|side| f64::from(side) / 2.0);
+        let ray = DVec3::new((x - self.cx) / self.fx, (y - self.cy) / self.fy, 1.0).normalize();
+        let turn = DMat4::from_quat(DQuat::from_rotation_arc(ray, DVec3::Z));
+        cameras.into_iter().map(|camera| camera * turn).collect()
+    }
 }
 
 /// The six numbers that pose estimation moves (spec 1): three angles in radians, `R = Rx(θ1)·Ry(θ2)·Rz(θ3)`, then the camera

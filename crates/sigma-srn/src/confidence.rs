@@ -89,6 +89,27 @@ impl std::fmt::Display for Doubt {
     }
 }
 
+/// How far off a pose may be, provided that it is no other one altogether.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Confidence {
+    /// Standard deviation of the rotation about all axes, degrees.
+    pub rotation_deg: f64,
+    /// Standard deviation of the camera's place, object units.
+    pub translation: f64,
+    /// Covariance of the motion from the estimate to the truth: a turn about the object's centre (rad), then a shift (object units), both in
+    /// the axes (OpenCV's) of the estimated camera.
+    pub covariance: Matrix6,
+}
+
+impl Confidence {
+    /// Of an estimate for an instance of `model`, if it is calibrated.
+    pub fn of(model: &Model, instance: u32, estimate: &Estimate) -> Option<Self> {
+        let covariance = estimate.covariance(&model.instance_name(instance), model.metadata.calibration.as_ref()?)?;
+        let (rotation_deg, translation) = deviations(&estimate.pose.to_matrix(), &covariance);
+        Some(Confidence { rotation_deg, translation, covariance })
+    }
+}
+
 impl Calibration {
     /// Why an estimate of this instance is not to be trusted, by what it leaves unexplained and by its rival, if there is one. An instance that
     /// is not in `at_truth` is taken for one as good as half of those that are.
@@ -296,7 +317,7 @@ fn sizes(known: &[Known], squared: &[f64]) -> (BTreeMap<String, f64>, Vec<f64>) 
 
 /// Standard deviations of an estimate: of the turn in degrees, and of the camera's place in object units; each the root of the sum over
 /// three axes.
-pub fn deviations(pose: &DMat4, covariance: &Matrix6) -> (f64, f64) {
+fn deviations(pose: &DMat4, covariance: &Matrix6) -> (f64, f64) {
     let block = |row: usize, column: usize| {
         let at = |i: usize| DVec3::from_array([0, 1, 2].map(|k| covariance[row + k][column + i]));
         DMat3::from_cols(at(0), at(1), at(2))

@@ -215,6 +215,8 @@ pub struct Progress<'a> {
     pub step: u32,
     /// Steps in all.
     pub steps: u32,
+    /// Searches that have gone before, where several follow one another: see [`Search`](crate::Search).
+    pub search: usize,
     /// `(query, start)` of each hypothesis in the running phase.
     pub hypotheses: &'a [(usize, usize)],
     /// The running descent; reading from it waits for the device. With BFGS its rays are no whole image, but those near what is to be seen.
@@ -319,7 +321,7 @@ pub fn estimate(
                 descent.set_initial_depths(&initial_depths(&mut random, rows))?;
             }
             descent.evaluate()?;
-            observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
+            observe(Progress { step, steps, search: 0, hypotheses: &names, descent: &mut descent })?;
             descent.descend()?;
             step += 1;
         }
@@ -328,7 +330,7 @@ pub fn estimate(
         } else {
             descent.evaluate()?;
         }
-        observe(Progress { step, steps, hypotheses: &names, descent: &mut descent })?;
+        observe(Progress { step, steps, search: 0, hypotheses: &names, descent: &mut descent })?;
         let standing = descent.standing()?;
         if Some(number) == last && matches!(options.method, Method::Bfgs { .. }) {
             // What BFGS has learnt of them by now depends on how many steps it took, and on their way.

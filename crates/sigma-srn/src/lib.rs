@@ -20,12 +20,14 @@ mod random;
 mod rays;
 mod region;
 mod renderer;
+mod search;
 mod torch;
+mod tracker;
 mod trainer;
 mod unseen;
 
 pub use camera::{Intrinsics, Pose6};
-pub use confidence::{Calibration, Doubt, Seen};
+pub use confidence::{Calibration, Confidence, Doubt, Seen};
 pub use descent::{Descent, Loss, Method, Shape};
 pub use engine::Engine;
 pub use error::Error;
@@ -34,10 +36,12 @@ pub use light::Light;
 pub use model::{Block, Hypernetwork, Kind, Layout, Metadata, Model, ModelConfig, Parameter, Source, write_atomically};
 pub use random::{Random, stream};
 pub use rays::{Rays, pixel_grid};
-pub use renderer::{Renderer, Rendering};
+pub use renderer::{Renderer, Rendering, View, render_views};
+pub use search::{Found, Search};
 #[cfg(not(target_family = "wasm"))]
 pub use srn_gpu::adapters;
 pub use srn_gpu::{AdapterInfo, Choice, Gpu, wgpu};
+pub use tracker::{Tracked, Tracker};
 pub use trainer::{Losses, Train, Trainer, TrainingBatch};
 pub use unseen::{Unseen, estimate_unseen};
 

@@ -23,6 +23,30 @@ pub struct Rendering {
     pub depth: Vec<f32>,
 }
 
+/// Instance, `world_from_camera` and intrinsics of a view.
+pub type View = (u32, DMat4, Intrinsics);
+
+/// Views of [`render_views`] that are rendered at once.
+const BATCH: usize = 8;
+
+/// Renders any number of views of `[width, height]` pixels.
+pub fn render_views(engine: &Engine, model: &Model, [width, height]: [u32; 2], views: &[View]) -> Result<Vec<Rendering>, Error> {
+    let batch = views.len().min(BATCH);
+    let mut renderer = Renderer::new(engine, model, batch as u32, width, height)?;
+    let mut renders = Vec::new();
+    for chunk in views.chunks(batch) {
+        // The renderer's size is fixed: the last batch is filled up with copies.
+        let filled: Vec<View> = chunk.iter().cycle().take(batch).copied().collect();
+        let instances: Vec<u32> = filled.iter().map(|view| view.0).collect();
+        let cameras: Vec<_> = filled.iter().map(|view| (view.1, view.2)).collect();
+        let Rendering { rgb, depth } = renderer.render(&instances, &cameras, 0)?;
+        let pixels = (width * height) as usize;
+        let each = rgb.chunks(3 * pixels).zip(depth.chunks(pixels)).take(chunk.len());
+        renders.extend(each.map(|(rgb, depth)| Rendering { rgb: rgb.to_vec(), depth: depth.to_vec() }));
+    }
+    Ok(renders)
+}
+
 struct Handles {
     network: Network,
     packed: BufferId,

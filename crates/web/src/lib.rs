@@ -13,8 +13,7 @@ use glam::DMat4;
 use js_sys::futures::jspi_block_on_promise;
 use js_sys::{Function, Promise};
 use sigma_srn::camera::{around84, neighbor4};
-use sigma_srn::confidence::{deviations, unexplained};
-use sigma_srn::{Effort, Engine, Gpu, Intrinsics, Model, Options, Query, Renderer, estimate, wgpu};
+use sigma_srn::{Effort, Engine, Gpu, Intrinsics, Model, Options, Query, Renderer, Search, wgpu};
 use wasm_bindgen::prelude::*;
 
 /// A model on an executor.
@@ -92,8 +91,9 @@ impl Session {
             intrinsics,
             starts,
         };
-        let options = Options::of(if is_fast { Effort::Fast } else { Effort::Normal });
-        let estimates = estimate(&self.engine, &self.model, &[query], &options, |progress| {
+        // No exhaustive one after it: the page shows the doubt, and who looks at it decides.
+        let search = Search::from(Options::of(if is_fast { Effort::Fast } else { Effort::Normal }));
+        let found = search.run(&self.engine, &self.model, &[query], |progress| {
             let losses = progress.descent.losses()?;
             let best = losses.into_iter().fold(f64::INFINITY, f64::min);
             let answer = observe.call3(&JsValue::NULL, &progress.step.into(), &progress.steps.into(), &best.into());
@@ -103,20 +103,13 @@ impl Session {
             }
             Ok(())
         })?;
-        let estimate = &estimates[0];
-        let world_from_camera = estimate.pose.to_matrix();
-        let view = self.view(instance, (world_from_camera, intrinsics), side)?;
-        let doubt = estimate.doubt(&self.model, instance, unexplained(&estimate.target, None, &view));
-        let name = self.model.instance_name(instance);
-        let calibration = self.model.metadata.calibration.as_ref();
-        let covariance = calibration.and_then(|calibration| estimate.covariance(&name, calibration));
-        let deviations = covariance.map(|covariance| deviations(&world_from_camera, &covariance));
+        let found = &found[0];
         Ok(Found {
-            world_from_camera: world_from_camera.transpose().to_cols_array().to_vec(),
-            doubt: doubt.map(|doubt| doubt.to_string()),
-            rotation_deg: deviations.map(|(rotation, _)| rotation),
-            translation: deviations.map(|(_, translation)| translation),
-            view: to_rgba(&view),
+            world_from_camera: found.world_from_camera.transpose().to_cols_array().to_vec(),
+            doubt: found.doubt.map(|doubt| doubt.to_string()),
+            rotation_deg: found.confidence.map(|confidence| confidence.rotation_deg),
+            translation: found.confidence.map(|confidence| confidence.translation),
+            view: to_rgba(&found.view),
         })
     }
 }

@@ -6,11 +6,11 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use sigma_srn::confidence::{self, Matrix6, fit, motion, unexplained};
-use sigma_srn::{Calibration, Effort, Options, Rendering, Seen};
+use sigma_srn::{Calibration, Effort, Found, Options, Rendering, Seen, View};
 
 use super::files::Picture;
 use super::notation::Notation;
-use super::search::{Found, On, PoseError, SearchArgs, Starts, View, render};
+use super::search::{self, On, PoseError, SearchArgs, Starts, render};
 use super::views::{self, Views, spread};
 use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_to_write};
 
@@ -107,7 +107,7 @@ pub fn run(args: &Calibrate) -> Result<bool> {
         *pictures = spread(std::mem::take(pictures), args.views as usize);
         *truths = spread(std::mem::take(truths), args.views as usize);
     }
-    let found = views::search(&asked, on, &args.search.trusting(), &args.starts, &Notation::default(), |_, _, _| Ok(()))?;
+    let found = views::search(&asked, on, &args.search.trusting(), &args.starts, &Notation::default(), |_, _| Ok(()))?;
     let mut known = Vec::new();
     for (Views { name, pictures, truths, .. }, found) in asked.iter().zip(&found) {
         let views = found.iter().zip(truths).zip(pictures);
@@ -203,7 +203,7 @@ fn lost(args: &Calibrate, on: On, asked: &[Views], at_truth: &AtTruth) -> Result
             Ok(all.into_iter().filter(|start| PoseError::of(start, truth).rotation_deg > FAR_DEG).collect())
         };
         let starts = pictures.iter().zip(truths).map(far).collect::<Result<Vec<_>>>()?;
-        let found = args.search.run(&options, on, pictures, &starts, |_| Ok(()))?;
+        let found = search::run(&args.search.single(options.clone()), on, pictures, &starts, |_| Ok(()))?;
         let views = found.iter().zip(truths).zip(pictures);
         let known = views.map(|((found, truth), picture)| Known::of(name, found, truth, at_truth.of_others(name, &picture.name)));
         // Rivals are those of a search that is not hindered.

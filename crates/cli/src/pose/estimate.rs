@@ -6,14 +6,14 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::{Doubt, Light, Model, Pose6};
+use sigma_srn::{Confidence, Doubt, Found, Light, Model, Pose6};
 use srn_data::camera::Axes;
 
 use super::files::{ObjectArgs, Picture, PoseSource, create_dir, mask_of, model_side, srn_instance};
 use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
-use super::search::{Confidence, Found, On, PoseError, SearchArgs, Starts};
+use super::search::{On, PoseError, SearchArgs, Starts, run as search};
 use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing, refuse_to_write};
 
 /// Flags of `sigma-pose estimate`.
@@ -166,13 +166,13 @@ pub fn run(args: &Estimate) -> Result<bool> {
 
     let bar = progress(0, "steps");
     let mut log = Log::default();
-    let found = args.search.run_until_trusted(on, &pictures, &starts, |searches, mut progress| {
+    let found = search(&args.search.search()?, on, &pictures, &starts, |mut progress| {
         bar.set_length(progress.steps.into());
-        if searches > 0 && progress.step == 0 {
+        if progress.search > 0 && progress.step == 0 {
             bar.set_message(format!("{}, once more", pictures[progress.hypotheses[0].0].name));
         }
         bar.set_position(progress.step.into());
-        if args.record.is_some() { log.note(searches, &mut progress) } else { Ok(()) }
+        if args.record.is_some() { log.note(&mut progress) } else { Ok(()) }
     })?;
     bar.finish_and_clear();
 

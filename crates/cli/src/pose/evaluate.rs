@@ -5,14 +5,14 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::Model;
+use sigma_srn::{Confidence, Found, Model};
 use srn_data::camera::Axes;
 use srn_data::sheet;
 
 use super::draw;
 use super::files::{Picture, create_dir, write_png};
 use super::notation::{Notation, NotationArgs};
-use super::search::{Confidence, Found, On, PoseError, SearchArgs, Starts};
+use super::search::{On, PoseError, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::tables;
@@ -135,7 +135,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     }
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
-    let found = views::search(&asked, on, &args.search, &args.starts, &notation, |_, _, _| Ok(()))?;
+    let found = views::search(&asked, on, &args.search, &args.starts, &notation, |_, _| Ok(()))?;
 
     let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();
     for ((views, source), found) in asked.iter().zip(sources).zip(found) {
@@ -215,8 +215,8 @@ pub(super) fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u3
     for (report, picture, found) in order.into_iter().take(most) {
         let views = [
             draw::view(&picture.rgb, side, SHOWN),
-            draw::view(&found.rgb, side, SHOWN),
-            draw::difference(&picture.rgb, &found.rgb, side, SHOWN),
+            draw::view(&found.view, side, SHOWN),
+            draw::difference(&picture.rgb, &found.view, side, SHOWN),
         ];
         let mut row = sheet::blank(3 * views[0].width() + 16, views[0].height() + 8);
         for (view, k) in views.iter().zip(0i64..) {

@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use image::{Rgb, RgbImage};
-use sigma_srn::Intrinsics;
+use sigma_srn::{Found, Intrinsics};
 use srn_data::pixels::Pixels;
 use srn_data::sheet::{self, BLACK, Colour};
 
 use super::files::{Picture, write_png};
-use super::search::{Found, On, render};
+use super::search::{On, render};
 use crate::common::Result;
 
 /// Colour of the line; its rim is black.

@@ -4,12 +4,12 @@ use std::path::Path;
 
 use glam::DMat4;
 use image::RgbImage;
-use sigma_srn::{Error, Pose6, Progress};
+use sigma_srn::{Error, Found, Pose6, Progress};
 use srn_data::sheet::{self, BLACK, CURVES, Colour, Curve};
 
 use super::draw;
 use super::files::{Picture, write_gif, write_png};
-use super::search::{Found, On, PoseError, render};
+use super::search::{On, PoseError, render};
 use crate::common::Result;
 
 /// Side of a view on the pages, pixels.
@@ -23,8 +23,8 @@ const FRAMES: usize = 40;
 
 /// Poses and losses of all hypotheses at one evaluation.
 struct Moment {
-    /// Searches that had gone before.
-    searches: usize,
+    /// See [`Progress::search`].
+    search: usize,
     step: u32,
     hypotheses: Vec<(usize, usize)>,
     losses: Vec<f64>,
@@ -45,9 +45,15 @@ struct Point {
 
 impl Log {
     /// Notes where all hypotheses are.
-    pub fn note(&mut self, searches: usize, progress: &mut Progress) -> std::result::Result<(), Error> {
+    pub fn note(&mut self, progress: &mut Progress) -> std::result::Result<(), Error> {
         let (losses, poses) = progress.descent.standing()?.into_iter().unzip();
-        self.0.push(Moment { searches, step: progress.step, hypotheses: progress.hypotheses.to_vec(), losses, poses });
+        self.0.push(Moment {
+            search: progress.search,
+            step: progress.step,
+            hypotheses: progress.hypotheses.to_vec(),
+            losses,
+            poses,
+        });
         Ok(())
     }
 
@@ -57,7 +63,7 @@ impl Log {
             let i = moment.hypotheses.iter().position(|&name| name == (picture, start))?;
             Some(Point { step: moment.step, loss: moment.losses[i], world_from_camera: moment.poses[i].to_matrix() })
         };
-        self.0.iter().filter(|moment| moment.searches + 1 == found.searches).filter_map(point).collect()
+        self.0.iter().filter(|moment| moment.search + 1 == found.searches).filter_map(point).collect()
     }
 
     /// Writes `NAME.png` and `NAME.gif` of picture number `index` to `dir`.

@@ -1,26 +1,20 @@
 //! The search for poses: its flags, and what it found.
 
 use std::path::PathBuf;
-use std::time::Instant;
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
-use glam::{DMat4, DQuat, DVec3};
+use glam::DMat4;
 use serde::Serialize;
 use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
-use sigma_srn::confidence::{deviations, unexplained, unexplained_doubt};
 use sigma_srn::{
-    Calibration, Doubt, Effort, Engine, Error, Estimate, Intrinsics, Loss, Method, Model, Options, Progress, Query, Renderer,
-    Rendering, Unseen, estimate, estimate_unseen,
+    Effort, Engine, Error, Found, Loss, Method, Model, Options, Progress, Query, Rendering, Search, View, render_views,
 };
 
 use super::files::Picture;
 use super::notation::Notation;
 use super::positive;
 use crate::common::{EngineArgs, Result};
-
-/// Views that are rendered at once.
-const RENDER_BATCH: usize = 8;
 
 /// What views are rendered by: an executor and a model, for pictures of `side` × `side` pixels.
 #[derive(Clone, Copy)]
@@ -199,123 +193,37 @@ impl SearchArgs {
         Ok(Options { seed: self.seed, ..options })
     }
 
-    /// Estimates the poses of `pictures`, each from its own starts. `options` are those of [`SearchArgs::options`], or others in their place.
-    pub fn run(
-        &self,
-        options: &Options,
-        on: On,
-        pictures: &[Picture],
-        starts: &[Vec<DMat4>],
-        observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
-    ) -> Result<Vec<Found>> {
-        let On { engine, model, side } = on;
-        let queries: Vec<_> = pictures.iter().zip(starts).map(|(picture, starts)| query(picture, side, starts)).collect();
-        let is_checked = engine.cooperative_difference().is_some();
-        let began = Instant::now();
-        let estimates = estimate(engine, model, &queries, options, observe)?;
-        let seconds = began.elapsed().as_secs_f64() / pictures.len() as f64;
-        if let Some(difference) = engine.cooperative_difference().filter(|_| !is_checked) {
-            let so = if engine.is_cooperative() { "wherever they are faster" } else { "are not used" };
-            eprintln!("cooperative matrices {so}: with them pose gradients differ by {difference:.1e} of the largest");
-        }
-
-        let view = |(picture, found): (&Picture, &Estimate)| (picture.instance, found.pose.to_matrix(), picture.intrinsics);
-        let views: Vec<View> = pictures.iter().zip(&estimates).map(view).collect();
-        let renders = render(on, &views)?;
-        let found = estimates.into_iter().zip(renders).zip(pictures);
-        let found = found.map(|((estimate, render), picture)| {
-            let doubt = |estimate: &Estimate, unexplained| estimate.doubt(model, picture.instance, unexplained);
-            self.found(model, picture, estimate, render, seconds, doubt)
-        });
-        Ok(found.collect())
+    /// The searches: a single one with the settings of [`SearchArgs::options`], unless the normal effort is asked for as it is.
+    pub fn search(&self) -> Result<Search> {
+        let options = self.options()?;
+        let mut normal = Search::of(Effort::Normal);
+        normal.tries.iter_mut().for_each(|options| options.seed = self.seed);
+        let search = if options == normal.tries[0] { normal } else { options.into() };
+        Ok(Search { accept: self.accept, ..search })
     }
 
-    /// The same, and once more, exhaustively, where the normal effort has found nothing to be trusted. `observe` is also told how many searches
-    /// for a picture have gone before, and sees them under the same numbers.
-    pub fn run_until_trusted(
-        &self,
-        on: On,
-        pictures: &[Picture],
-        starts: &[Vec<DMat4>],
-        mut observe: impl FnMut(usize, Progress) -> std::result::Result<(), Error>,
-    ) -> Result<Vec<Found>> {
-        let options = self.options()?;
-        let mut all = self.run(&options, on, pictures, starts, |progress| observe(0, progress))?;
-        let is_normal = options == Options { seed: self.seed, ..Options::of(Effort::Normal) };
-        let exhaustive = Options { seed: self.seed, ..Options::of(Effort::Exhaustive) };
-        for (i, found) in all.iter_mut().enumerate().filter(|(_, found)| is_normal && !found.is_trusted()) {
-            let mut again = self.run(&exhaustive, on, &pictures[i..=i], &starts[i..=i], |progress| {
-                let hypotheses: Vec<_> = progress.hypotheses.iter().map(|(_, start)| (i, *start)).collect();
-                observe(1, Progress { hypotheses: &hypotheses, ..progress })
-            })?;
-            let again = again.remove(0);
-            let seconds = found.seconds + again.seconds;
-            // The first search's pose stays where the second has found no better one. In the picture's own colours: with little contrast there is
-            // little loss, too.
-            let loss = |found: &Found| found.estimate.loss / found.estimate.light.map_or(1.0, |light| f64::from(light.contrast));
-            if loss(&again) < loss(found) {
-                *found = Found { searches: 2, ..again };
-            }
-            found.seconds = seconds;
-        }
-        Ok(all)
+    /// The first of them alone, or one with other settings.
+    pub fn single(&self, options: Options) -> Search {
+        Search { accept: self.accept, ..options.into() }
     }
 
     /// Estimates the pose of an object that the model was not trained on. The model with the object is returned too.
     pub fn run_unseen(
         &self,
-        on: On,
+        On { engine, model, side }: On,
         picture: &Picture,
         starts: &[DMat4],
         observe: impl FnMut(usize, usize) -> std::result::Result<(), Error>,
     ) -> Result<(Found, Model)> {
-        let On { engine, model, side } = on;
-        let began = Instant::now();
-        let query = query(picture, side, starts);
-        // It has no calibration: the deviations that `calibrate` has found are those of known objects.
-        let unseen = estimate_unseen(engine, model, &query, self.seed, observe)?;
-        let seconds = began.elapsed().as_secs_f64();
-        let view = (0, unseen.estimate.pose.to_matrix(), picture.intrinsics);
-        let render = render(On { model: &unseen.model, ..on }, &[view])?.swap_remove(0);
-        let Unseen { ref estimate, model: ref fitted, .. } = unseen;
-        let doubt = |_: &Estimate, unexplained| unseen.doubt(model, unexplained);
-        let found = self.found(fitted, picture, estimate.clone(), render, seconds, doubt);
-        Ok((found, unseen.model))
+        let search = self.single(Options { seed: self.seed, ..Options::default() });
+        Ok(search.run_unseen(engine, model, &query(picture, side, starts), observe)?)
     }
 
-    /// `doubt`: why it is not to be trusted with so much of the picture unexplained, unless `--accept` decides alone.
-    fn found(
-        &self,
-        model: &Model,
-        picture: &Picture,
-        estimate: Estimate,
-        render: Rendering,
-        seconds: f64,
-        doubt: impl FnOnce(&Estimate, f64) -> Option<Doubt>,
-    ) -> Found {
-        let unexplained = unexplained(&estimate.target, picture.weights.as_deref(), &render.rgb);
-        let doubt = match self.accept {
-            Some(_) if !estimate.loss.is_finite() => Some(Doubt::Loss),
-            Some(most) => unexplained_doubt(unexplained, most),
-            None => doubt(&estimate, unexplained),
-        };
-        let calibration = model.metadata.calibration.as_ref();
-        let instance = model.instance_name(picture.instance);
-        let confidence = calibration.and_then(|calibration| Confidence::of(&estimate, &instance, calibration));
-        let world_from_camera = estimate.pose.to_matrix();
-        Found { world_from_camera, estimate, rgb: render.rgb, unexplained, doubt, confidence, searches: 1, seconds }
-    }
-
-    /// Starts all around the object, turned so that it appears in the middle of the picture: a cut may lie anywhere beside the
-    /// principal point.
+    /// Starts all around the object, which appears in the middle of the picture.
     fn around(&self, starts: fn(f64) -> Vec<DMat4>, model: &Model, picture: &Picture, side: u32) -> Result<Vec<DMat4>> {
         let radius = self.radius.or(picture.distance).or(model.metadata.orbit_radius);
         let radius = radius.ok_or("the model does not say how far its cameras were: give --radius")?;
-        let Intrinsics { fx, fy, cx, cy, .. } = picture.intrinsics;
-        let middle = f64::from(side) / 2.0;
-        let ray = DVec3::new((middle - cx) / fx, (middle - cy) / fy, 1.0).normalize();
-        let turn = DMat4::from_quat(DQuat::from_rotation_arc(ray, DVec3::Z));
-        Ok(starts(radius).into_iter().map(|start| start * turn).collect())
+        Ok(picture.intrinsics.centred([side, side], starts(radius)))
     }
 
     /// The poses to start from for a picture of `side` pixels; `rough` is the one that `neighbor4` turns.
@@ -340,7 +248,31 @@ impl SearchArgs {
     }
 }
 
-fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
+/// Estimates the poses of `pictures`, each from its own starts.
+pub fn run(
+    search: &Search,
+    On { engine, model, side }: On,
+    pictures: &[Picture],
+    starts: &[Vec<DMat4>],
+    observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
+) -> Result<Vec<Found>> {
+    let queries: Vec<_> = pictures.iter().zip(starts).map(|(picture, starts)| query(picture, side, starts)).collect();
+    with_cooperative_said(engine, || Ok(search.run(engine, model, &queries, observe)?))
+}
+
+/// What is done, and then on stderr what cooperative matrices were found to be worth, if that was now.
+pub fn with_cooperative_said<T>(engine: &Engine, run: impl FnOnce() -> Result<T>) -> Result<T> {
+    let is_checked = engine.cooperative_difference().is_some();
+    let found = run()?;
+    if let Some(difference) = engine.cooperative_difference().filter(|_| !is_checked) {
+        let so = if engine.is_cooperative() { "wherever they are faster" } else { "are not used" };
+        eprintln!("cooperative matrices {so}: with them pose gradients differ by {difference:.1e} of the largest");
+    }
+    Ok(found)
+}
+
+/// A picture as the library takes it.
+pub fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
     Query {
         instance: picture.instance,
         rgb: picture.rgb.clone(),
@@ -351,55 +283,6 @@ fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
         height: side,
         intrinsics: picture.intrinsics,
         starts: starts.to_vec(),
-    }
-}
-
-/// What a search found for one picture.
-#[derive(Clone, Debug)]
-pub struct Found {
-    /// The estimate with all starts ranked.
-    pub estimate: Estimate,
-    /// The pose.
-    pub world_from_camera: DMat4,
-    /// The model's view from there `[side, side, 3]`.
-    pub rgb: Vec<f32>,
-    /// The part of the picture that the render leaves unexplained: the sum of absolute differences to the render, over that to
-    /// an empty (white) picture, of the pixels that count. 0: equal; 1: no better than nothing.
-    pub unexplained: f64,
-    /// Why it is not to be trusted, if it is not.
-    pub doubt: Option<Doubt>,
-    /// How far off the pose may be, if the model is calibrated.
-    pub confidence: Option<Confidence>,
-    /// Which search this is the end of, see [`SearchArgs::run_until_trusted`].
-    pub searches: usize,
-    /// Seconds of all searches, a picture's share of their batch.
-    pub seconds: f64,
-}
-
-impl Found {
-    /// Whether there is no doubt.
-    pub fn is_trusted(&self) -> bool {
-        self.doubt.is_none()
-    }
-}
-
-/// How far off a pose may be, provided that it is no other one altogether.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Confidence {
-    /// Standard deviation of the rotation about all axes, degrees.
-    pub rotation_deg: f64,
-    /// Standard deviation of the camera's place, object units.
-    pub translation: f64,
-    /// Covariance of the motion from the estimate to the truth: a turn about the object's centre (rad), then a shift (object units), both in
-    /// the axes (OpenCV's) of the estimated camera.
-    pub covariance: [[f64; 6]; 6],
-}
-
-impl Confidence {
-    fn of(estimate: &Estimate, instance: &str, calibration: &Calibration) -> Option<Self> {
-        let covariance = estimate.covariance(instance, calibration)?;
-        let (rotation_deg, translation) = deviations(&estimate.pose.to_matrix(), &covariance);
-        Some(Confidence { rotation_deg, translation, covariance })
     }
 }
 
@@ -432,32 +315,17 @@ impl std::fmt::Display for PoseError {
     }
 }
 
-/// Instance, `world_from_camera` and intrinsics of a view.
-pub type View = (u32, DMat4, Intrinsics);
-
 /// Renders views, a few at a time.
 pub fn render(On { engine, model, side }: On, views: &[View]) -> Result<Vec<Rendering>> {
-    let batch = views.len().min(RENDER_BATCH);
-    let mut renderer = Renderer::new(engine, model, batch as u32, side, side)?;
-    let mut renders = Vec::new();
-    for chunk in views.chunks(batch) {
-        // The renderer's size is fixed: the last batch is filled up with copies.
-        let filled: Vec<View> = chunk.iter().cycle().take(batch).copied().collect();
-        let instances: Vec<u32> = filled.iter().map(|view| view.0).collect();
-        let cameras: Vec<_> = filled.iter().map(|view| (view.1, view.2)).collect();
-        let Rendering { rgb, depth } = renderer.render(&instances, &cameras, 0)?;
-        let pixels = (side * side) as usize;
-        let each = rgb.chunks(3 * pixels).zip(depth.chunks(pixels)).take(chunk.len());
-        renders.extend(each.map(|(rgb, depth)| Rendering { rgb: rgb.to_vec(), depth: depth.to_vec() }));
-    }
-    Ok(renders)
+    Ok(render_views(engine, model, [side, side], views)?)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use clap::Parser;
-    use sigma_srn::ModelConfig;
+    use glam::DVec3;
+    use sigma_srn::{Intrinsics, ModelConfig};
 
     #[derive(Parser)]
     struct Flags {
@@ -501,36 +369,15 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_trusted_is_searched_for_once_more() {
-        let model = Model::init(&ModelConfig { hidden: 8, latent: 4, instances: 1, tracing_steps: 2, density: true }, 3).unwrap();
-        let engine = Engine::cpu();
-        let on = On { engine: &engine, model: &model, side: 8 };
-        let of = |shade: f32| {
-            let seen = picture(Intrinsics { fx: 9.0, fy: 9.0, cx: 4.0, cy: 4.0, pixel_center: 0.0 });
-            Picture { rgb: (0..192).map(|k| shade - (k % 7) as f32 / 9.0).collect(), ..seen }
+    fn only_the_normal_effort_as_it_is_searches_once_more() {
+        let tries = |flags: &str| {
+            let search = Flags::parse_from(format!("sigma-pose --seed 3 {flags}").split_whitespace()).search.search().unwrap();
+            assert!(search.tries.iter().all(|options| options.seed == 3), "{flags}");
+            search.tries.len()
         };
-        // The searches, the images, and the losses that a call comes across.
-        let searched = |flags: &str| {
-            let search = Flags::parse_from(format!("sigma-pose {flags}").split(' ')).search;
-            let starts = vec![vec![fixed24(1.3)[5]]; 2];
-            let (mut seen, mut lowest) = (std::collections::BTreeSet::new(), [f64::INFINITY; 2]);
-            let observe = |searches: usize, progress: Progress| {
-                for ((query, _), (loss, _)) in progress.hypotheses.iter().zip(progress.descent.standing()?) {
-                    seen.insert((searches, *query));
-                    if progress.step == progress.steps {
-                        lowest[*query] = lowest[*query].min(loss);
-                    }
-                }
-                Ok(())
-            };
-            let found = search.run_until_trusted(on, &[of(0.9), of(0.4)], &starts, observe).unwrap();
-            assert_eq!([found[0].estimate.loss, found[1].estimate.loss], lowest, "{flags}");
-            seen.into_iter().collect::<Vec<_>>()
-        };
-        assert_eq!(searched("--accept 1e9"), [(0, 0), (0, 1)]);
-        assert_eq!(searched("--accept 1e-9"), [(0, 0), (0, 1), (1, 0), (1, 1)]);
+        assert_eq!([tries(""), tries("--accept 0.1"), tries("--radius 2")], [2; 3]);
         for plain in ["--effort fast", "--effort exhaustive", "--steps 9", "--no-cull", "--preset paper --steps 9"] {
-            assert_eq!(searched(&format!("--accept 1e-9 {plain}")), [(0, 0), (0, 1)], "{plain}");
+            assert_eq!(tries(plain), 1, "{plain}");
         }
     }
 }

@@ -4,10 +4,10 @@ use std::f64::consts::TAU;
 
 use glam::{DMat3, DMat4, DVec3};
 use serde::Serialize;
-use sigma_srn::Intrinsics;
 use sigma_srn::camera::around84;
+use sigma_srn::{Intrinsics, View};
 
-use super::search::{On, View, render};
+use super::search::{On, render};
 use crate::common::{Result, progress};
 
 /// Views that are compared.

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::Instant;
 
-use sigma_srn::{Engine, Loss, Model};
+use sigma_srn::{Engine, Found, Loss, Model};
 use srn_data::camera::Axes;
 use srn_data::sheet::{self, CURVES, Curve};
 use srn_data::{Dataset, Instance};
@@ -12,7 +12,7 @@ use srn_data::{Dataset, Instance};
 use super::evaluate::{Evaluate, ViewReport, pictures_sheet, view_report};
 use super::files::{Picture, create_dir, write_png};
 use super::notation::Notation;
-use super::search::{Found, LOSSES, On, PoseError, Preset, SearchArgs, Starts};
+use super::search::{LOSSES, On, PoseError, Preset, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::views::{self, Views, spread};
@@ -270,9 +270,9 @@ impl Bench<'_> {
             // Each search begins when the one before has ended: before its first evaluation.
             let mut last = Instant::now();
             let (mut running, mut began, mut number) = (0, last, 0);
-            views::search(asked, on, &search, &setting.starts, &notation, |i, searches, progress| {
+            views::search(asked, on, &search, &setting.starts, &notation, |i, progress| {
                 // The figure is one of single searches.
-                if searches > 0 {
+                if progress.search > 0 {
                     last = Instant::now();
                     return Ok(());
                 }

@@ -3,23 +3,19 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::{Doubt, Options, Phase, Pose6};
+use sigma_srn::{Confidence, Doubt, Found, Pose6, Tracked, Tracker};
 
 use super::draw;
 use super::files::{Animation, ObjectArgs, Picture, PoseSource, mask_of, model_side};
 use super::notation::NotationArgs;
-use super::search::{Confidence, Found, On, PoseError, SearchArgs, Starts};
+use super::search::{PoseError, SearchArgs, Starts, query, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
 
 /// Side of a frame in the animation, pixels.
 const SHOWN: u32 = 192;
 /// Seconds that it stays.
 const STAY: f64 = 0.1;
-
-/// Pixels that a mask may be off, as the model sees it: as far as a search tries. An object that comes from near to far has fewer pixels to lose.
-const WIDEST_RIM: f64 = 2.0;
 
 /// Flags of `sigma-pose track`.
 #[derive(Args, Debug)]
@@ -89,61 +85,30 @@ pub fn run(args: &Track) -> Result<bool> {
     // Whoever waits for a frame is ready for it.
     let first = frames.next().ok_or("stdin: no frame's path on it")??;
     let side = model_side(&model, &first)?;
-    let on = On { engine: &engine, model: &model, side };
-    let all_around = args.search.options()?;
-    // The next pose is near; what would have to be found from afar is searched for all around instead.
-    let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, dilate: false };
-    let phases = [phase(5, 2, 2), Phase { dilate: true, ..phase(5, 2, 1) }, phase(3, 1, 1)];
-    let with = |phases: &[Phase]| Options { phases: phases.to_vec(), min_starts: 0, ..all_around.clone() };
-    let (with_mask, from_frame_to_frame) = (with(&phases), with(&[phases[0], phases[2]]));
-
     let mut animation = None;
-    // The last two poses, the later one first.
-    let mut before: Vec<DMat4> = Vec::new();
-    // By how many pixels of the frames their masks are too small, as far as that was tried: who cuts does it alike from frame to frame.
-    let mut dilation: Option<f64> = None;
+    let mut tracker = None;
     let (mut errors, mut searches, mut trusted, mut count) = (Vec::new(), 0, true, 0);
     for path in std::iter::once(Ok(first)).chain(frames) {
         let path = path?;
         let mask = args.mask.as_ref().map(|mask| mask_of(mask, &path)).transpose()?;
-        let mut picture =
-            Picture::open(&path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
-        let frame_pixels = picture.pixels_on_disk(side);
-        picture.dilation = (dilation.unwrap_or(0.0) / frame_pixels).clamp(-WIDEST_RIM, WIDEST_RIM);
-        if let (0, Some(rough)) = (count, &args.rough) {
-            before = vec![rough.read(&path, &notation)?];
-        }
-        count += 1;
-        let run = |options: &Options, starts: Vec<DMat4>| -> Result<Found> {
-            let found = args.search.run(options, on, std::slice::from_ref(&picture), &[starts], |_| Ok(()));
-            Ok(found?.swap_remove(0))
-        };
-        let followed = match before[..] {
-            [] => None,
-            [last] if dilation.is_none() => Some(run(&with_mask, vec![last])?),
-            [last] => Some(run(&from_frame_to_frame, vec![last])?),
-            // It stands still, or goes on as it did.
-            [last, earlier, ..] => Some(run(&from_frame_to_frame, vec![last, last * earlier.inverse() * last])?),
-        };
-        // An object that comes too near or goes too far away is followed all the same.
-        let followed = followed.filter(|found| matches!(found.doubt, None | Some(Doubt::Distance | Doubt::Small)));
-        let searched = followed.is_none();
-        let found = match followed {
-            Some(found) => found,
-            None => {
-                let starts = args.search.starts(&Starts::Around84, &model, &picture, side, None, &notation)?;
-                run(&all_around, starts)?
+        let picture = Picture::open(&path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
+        let starts = args.search.starts(&Starts::Around84, &model, &picture, side, None, &notation)?;
+        let tracker = match &mut tracker {
+            Some(tracker) => tracker,
+            none => {
+                let rough = args.rough.as_ref().map(|rough| rough.read(&path, &notation)).transpose()?;
+                none.insert(Tracker::new(args.search.single(args.search.options()?), rough))
             }
         };
+        count += 1;
+        let frame = query(&picture, side, &starts);
+        let Tracked { found, is_searched: searched } =
+            with_cooperative_said(&engine, || Ok(tracker.next(&engine, &model, frame, |_| Ok(()))?))?;
         trusted = found.is_trusted();
-        if trusted {
-            dilation = found.estimate.dilation.map(|by| by * frame_pixels).or(dilation);
-        }
-        before.truncate(if searched { 0 } else { 1 });
-        // Else what is not to be trusted is no place to go on from.
-        if trusted || !searched {
-            before.insert(0, found.world_from_camera);
-        }
+        // In pixels of the frame.
+        let frame_pixels = picture.pixels_on_disk(side);
+        let known = tracker.rim().map(|rim| rim * picture.intrinsics.fx);
+        let dilation = found.estimate.dilation.or(known).map(|by| by * frame_pixels);
         let truth = args.truth.as_ref().map(|truth| truth.read(&path, &notation)).transpose()?;
         let error = truth.map(|truth| PoseError::of(&found.world_from_camera, &truth));
         errors.extend(error);
@@ -165,7 +130,7 @@ pub fn run(args: &Track) -> Result<bool> {
             doubt: found.doubt,
             confidence: found.confidence,
             searched,
-            mask_dilation_px: found.estimate.dilation.map(|by| by * frame_pixels).or(dilation),
+            mask_dilation_px: dilation,
             error,
             seconds: found.seconds,
         };
@@ -226,8 +191,8 @@ fn pictures_in(dir: &Path) -> Result<Vec<PathBuf>> {
 fn side_by_side(picture: &Picture, found: &Found, side: u32) -> image::RgbImage {
     let views = [
         draw::view(&picture.rgb, side, SHOWN),
-        draw::view(&found.rgb, side, SHOWN),
-        draw::difference(&found.estimate.target, &found.rgb, side, SHOWN),
+        draw::view(&found.view, side, SHOWN),
+        draw::difference(&found.estimate.target, &found.view, side, SHOWN),
     ];
     let mut row = image::RgbImage::new(3 * views[0].width(), views[0].height());
     for (view, k) in views.iter().zip(0i64..) {

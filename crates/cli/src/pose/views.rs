@@ -3,13 +3,13 @@
 use std::path::{Path, PathBuf};
 
 use glam::DMat4;
-use sigma_srn::{Error, Intrinsics, Model, Progress};
+use sigma_srn::{Error, Found, Intrinsics, Model, Progress};
 use srn_data::LoadedView;
 use srn_data::srn::SrnSet;
 
 use super::files::{Picture, model_side};
 use super::notation::Notation;
-use super::search::{Found, On, SearchArgs, Starts};
+use super::search::{On, SearchArgs, Starts, run};
 use crate::common::{Result, camera, progress};
 
 /// Views of one instance.
@@ -53,17 +53,17 @@ pub fn open(model: &Model, data: &Path, instances: u32, views: u32) -> Result<(u
     Ok((side, all))
 }
 
-/// Searches for all views, instance by instance, with a bar on stderr. `observe` also gets the number of the instance, and
-/// how many searches have gone before. Returns what was found for the views of each.
+/// Searches for all views, instance by instance, with a bar on stderr. `observe` also gets the number of the
+/// instance. Returns what was found for the views of each.
 pub fn search(
     asked: &[Views],
     on: On,
     args: &SearchArgs,
     starts: &Starts,
     notation: &Notation,
-    mut observe: impl FnMut(usize, usize, Progress) -> std::result::Result<(), Error>,
+    mut observe: impl FnMut(usize, Progress) -> std::result::Result<(), Error>,
 ) -> Result<Vec<Vec<Found>>> {
-    let options = args.options()?;
+    let search = args.search()?;
     // All starts are known before the first is searched for.
     let mut all_starts = Vec::new();
     for Views { pictures, truths, .. } in asked {
@@ -71,18 +71,18 @@ pub fn search(
         all_starts.push(pictures.iter().zip(truths).map(of).collect::<Result<Vec<_>>>()?);
     }
     // Views of data sets have no masks to be dilated.
-    let steps: u64 = options.phases.iter().filter(|phase| !phase.dilate).map(|phase| u64::from(phase.steps)).sum();
+    let steps: u64 = search.tries[0].phases.iter().filter(|phase| !phase.dilate).map(|phase| u64::from(phase.steps)).sum();
     let bar = progress(steps * asked.len() as u64, "steps");
     let mut found = Vec::new();
     for (i, (Views { name, pictures, .. }, starts)) in asked.iter().zip(&all_starts).enumerate() {
         bar.set_message(name.clone());
-        found.push(args.run_until_trusted(on, pictures, starts, |searches, progress| {
-            if searches == 0 {
+        found.push(run(&search, on, pictures, starts, |progress| {
+            if progress.search == 0 {
                 bar.set_position(i as u64 * steps + u64::from(progress.step));
             } else {
                 bar.set_message(format!("{name}, once more"));
             }
-            observe(i, searches, progress)
+            observe(i, progress)
         })?);
     }
     bar.finish_and_clear();

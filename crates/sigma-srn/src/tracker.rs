@@ -1,0 +1,99 @@
+//! An object's pose from frame to frame: the next one is near the last.
+
+use glam::DMat4;
+
+use crate::confidence::Doubt;
+use crate::estimator::{Options, Phase, Progress, Query};
+use crate::search::{Found, Search};
+use crate::{Engine, Error, Model};
+
+/// Pixels that a mask may be off, as the model sees it: as far as a search tries. An object that comes from near to far has fewer pixels to lose.
+const WIDEST_RIM: f64 = 2.0;
+
+/// Follows an object through the frames of a video. A frame that the last pose does not lead to is searched all around.
+#[derive(Clone, Debug)]
+pub struct Tracker {
+    search: Search,
+    /// The last two poses, the later one first.
+    before: Vec<DMat4>,
+    rim: Option<f64>,
+}
+
+/// What was found for a frame.
+#[derive(Clone, Debug)]
+pub struct Tracked {
+    /// The pose and what there is to say about it.
+    pub found: Found,
+    /// It is not from the pose in the frame before, but was searched for from [`Query::starts`].
+    pub is_searched: bool,
+}
+
+impl Tracker {
+    /// `search` is for the first frame, unless the object's pose there is known, `rough`ly, and for frames in which it was lost. A try that takes
+    /// seconds more is seldom worth it there: the next frame is the second search.
+    pub fn new(search: Search, rough: Option<DMat4>) -> Self {
+        Tracker { search, before: rough.into_iter().collect(), rim: None }
+    }
+
+    /// Finds the pose in the next frame. [`Query::starts`] are where to search if it does not lie near the last pose, all around the object say.
+    /// [`Query::dilation`] is not looked at: who cuts frames out does it alike from one to the next, so by how much masks are too small is found out once.
+    pub fn next(
+        &mut self,
+        engine: &Engine,
+        model: &Model,
+        frame: Query,
+        mut observe: impl FnMut(Progress) -> Result<(), Error>,
+    ) -> Result<Tracked, Error> {
+        let focal = frame.intrinsics.fx;
+        let dilation = (self.rim.unwrap_or(0.0) * focal).clamp(-WIDEST_RIM, WIDEST_RIM);
+        let frame = Query { dilation, ..frame };
+        let near = match self.before[..] {
+            [] => None,
+            [last] => Some(vec![last]),
+            // It stands still, or goes on as it did.
+            [last, earlier, ..] => Some(vec![last, last * earlier.inverse() * last]),
+        };
+        let followed = match near {
+            Some(starts) => {
+                let frame = Query { starts, ..frame.clone() };
+                Some(self.near()?.run(engine, model, &[frame], &mut observe)?.remove(0))
+            }
+            None => None,
+        };
+        // An object that comes too near or goes too far away is followed all the same.
+        let followed = followed.filter(|found| matches!(found.doubt, None | Some(Doubt::Distance | Doubt::Small)));
+        let is_searched = followed.is_none();
+        let found = match followed {
+            Some(found) => found,
+            None => self.search.run(engine, model, &[frame], &mut observe)?.remove(0),
+        };
+        // Else it was not tried.
+        if found.is_trusted() && (is_searched || self.rim.is_none()) {
+            self.rim = found.estimate.dilation.map(|by| by / focal).or(self.rim);
+        }
+        self.before.truncate(if is_searched { 0 } else { 1 });
+        // Else what is not to be trusted is no place to go on from.
+        if found.is_trusted() || !is_searched {
+            self.before.insert(0, found.world_from_camera);
+        }
+        Ok(Tracked { found, is_searched })
+    }
+
+    /// By how much the masks of the frames are too small, or too large where this is below zero, as far as that was tried: as a part of the
+    /// distance, or pixels over the focal length.
+    pub fn rim(&self) -> Option<f64> {
+        self.rim
+    }
+
+    /// The next pose is near; what would have to be found from afar is searched for all around instead.
+    fn near(&self) -> Result<Search, Error> {
+        let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, dilate: false };
+        let mut phases = vec![phase(5, 2, 2), Phase { dilate: true, ..phase(5, 2, 1) }, phase(3, 1, 1)];
+        if self.rim.is_some() || self.before.len() > 1 {
+            phases.remove(1);
+        }
+        let (first, _) = self.search.tries()?;
+        let options = Options { phases, min_starts: 0, ..first.clone() };
+        Ok(Search { tries: vec![options], accept: self.search.accept })
+    }
+}
