@@ -30,10 +30,12 @@ fn an_object_is_followed_and_found_again() {
     let error = |found: &Tracked, truth: &DMat4| camera::pose_error(&found.found.world_from_camera, truth).0;
     let search = Search { accept: Some(0.25), ..Search::from(Options { min_starts: 0, ..Options::of(Effort::Fast) }) };
 
-    let mut tracker = Tracker::new(search.clone(), None);
+    let new = |search, rough| Tracker::new(&engine, model, instance, search, rough).unwrap();
+
+    let mut tracker = new(search.clone(), None);
     let mut searched = Vec::new();
     for (number, camera) in cameras().iter().enumerate() {
-        let next = tracker.next(&engine, model, frame(camera, intrinsics, false), |_| Ok(())).unwrap();
+        let next = tracker.next(frame(camera, intrinsics, false), |_| Ok(())).unwrap();
         println!("frame {number} {:.2}° off, {:.0} %", error(&next, camera), 100.0 * next.found.unexplained);
         assert!(next.found.is_trusted() && error(&next, camera) < 1.0, "frame {number}");
         if next.is_searched {
@@ -43,16 +45,16 @@ fn an_object_is_followed_and_found_again() {
     assert_eq!((searched, tracker.rim()), (vec![0, 4], None));
 
     // Nothing is good enough: no frame leads to the next.
-    let mut tracker = Tracker::new(Search { accept: Some(1e-9), ..search.clone() }, Some(cameras()[0]));
+    let mut tracker = new(Search { accept: Some(1e-9), ..search.clone() }, Some(cameras()[0]));
     for camera in &cameras()[..2] {
-        let next = tracker.next(&engine, model, frame(camera, intrinsics, false), |_| Ok(())).unwrap();
+        let next = tracker.next(frame(camera, intrinsics, false), |_| Ok(())).unwrap();
         assert_eq!((next.is_searched, next.found.doubt), (true, Some(Doubt::Unexplained)));
     }
 
     // How far off masks are is found out in the first frame and known in those that follow, also through a lens that shows more pixels of it.
-    let mut tracker = Tracker::new(search, Some(cameras()[0]));
+    let mut tracker = new(search, Some(cameras()[0]));
     let mut next = |k: usize, intrinsics: Intrinsics| {
-        let next = tracker.next(&engine, model, frame(&cameras()[k], intrinsics, true), |_| Ok(())).unwrap();
+        let next = tracker.next(frame(&cameras()[k], intrinsics, true), |_| Ok(())).unwrap();
         assert!(!next.is_searched);
         (tracker.rim().unwrap() * intrinsics.fx, next.found.estimate.dilation.unwrap())
     };
@@ -63,4 +65,8 @@ fn an_object_is_followed_and_found_again() {
         let (rim_there, dilation) = next(k, intrinsics);
         assert!((rim_there - times * rim).abs() < 1e-9 && dilation == rim_there, "{rim_there} {dilation}");
     }
+
+    let other = Query { instance: instance + 1, ..frame(&cameras()[0], intrinsics, false) };
+    let error = tracker.next(other, |_| Ok(())).unwrap_err().to_string();
+    assert!(error.starts_with("frame: shows instance"), "{error}");
 }

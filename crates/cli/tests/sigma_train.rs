@@ -359,7 +359,7 @@ fn checkpoints_of_torch_come_and_go() {
     let before = fs::read(&model).unwrap();
     fs::write(at("two.txt"), "beetle\nmini\n").unwrap();
     let (baked, new, dir) = (at("baked.safetensors"), at("new"), dir.path().display());
-    imported.bake(1).unwrap().save(Path::new(&baked)).unwrap();
+    imported.bake(&[1]).unwrap().save(Path::new(&baked)).unwrap();
     for (args, words) in [
         (import.clone(), &["model.safetensors", "exists already", "--force"][..]),
         (format!("export {model} --out {back}"), &["back.pth", "exists already"]),

@@ -20,7 +20,7 @@ fn main() -> Result<(), sigma_srn::Error> {
 
     // For the first frame, and for those in which it was lost.
     let search = Search::from(Options::of(Effort::Fast));
-    let mut tracker = Tracker::new(search, None);
+    let mut tracker = Tracker::new(&engine, &model, 0, search, None)?;
     for frame in 0..20 {
         let angle = 0.1 * f64::from(frame);
         let truth = camera::look_at_origin(glam::DVec3::new(radius * angle.cos(), radius * angle.sin(), 0.4));
@@ -35,7 +35,7 @@ fn main() -> Result<(), sigma_srn::Error> {
             intrinsics,
             starts: camera::around84(radius),
         };
-        let Tracked { found, is_searched } = tracker.next(&engine, &model, query, |_| Ok(()))?;
+        let Tracked { found, is_searched } = tracker.next(query, |_| Ok(()))?;
         let (rotation, translation) = camera::pose_error(&found.world_from_camera, &truth);
         let how = if is_searched { "searched for" } else { "followed" };
         let verdict = found.doubt.map_or("trusted".into(), |doubt| format!("not to be trusted: {doubt}"));

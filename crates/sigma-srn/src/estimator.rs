@@ -248,6 +248,8 @@ pub fn estimate(
     mut observe: impl FnMut(Progress) -> Result<(), Error>,
 ) -> Result<Vec<Estimate>, Error> {
     check(model, queries, options)?;
+    let (model, queries) = at_work(model, queries)?;
+    let (model, queries) = (&*model, &*queries);
     let can_dilate =
         |query: &Query| query.coverage.as_ref().is_some_and(|coverage| has_outline(coverage, query.weights.as_deref()));
     let runs = |phase: &&Phase| !phase.dilate || queries.iter().any(can_dilate);
@@ -385,6 +387,17 @@ pub fn estimate(
         estimates.push(Estimate { pose, loss, curvature, light, dilation, target, extent, ranking });
     }
     Ok(estimates)
+}
+
+/// The model for work on these queries, see [`Model::for_work_on`], and they with the numbers that their instances have there.
+pub(crate) fn at_work<'a>(model: &'a Model, queries: &'a [Query]) -> Result<(Cow<'a, Model>, Cow<'a, [Query]>), Error> {
+    let instances: Vec<u32> = queries.iter().map(|query| query.instance).collect();
+    let (at_work, numbers) = model.for_work_on(&instances)?;
+    if numbers == instances {
+        return Ok((at_work, queries.into()));
+    }
+    let numbered = zip(queries, numbers).map(|(query, instance)| Query { instance, ..query.clone() });
+    Ok((at_work, numbered.collect()))
 }
 
 fn is_gmsd(method: Method) -> bool {

@@ -1,5 +1,6 @@
 //! A model: its sizes, and its parameters by the names of the released checkpoints.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -55,14 +56,14 @@ pub struct Hypernetwork {
 pub enum Source {
     /// Made from the instance's code.
     Hypernetwork(Hypernetwork),
-    /// Stored, those of the one instance that the model knows ([`Model::bake`]): one parameter per layer.
+    /// Stored, those of the few instances that the model knows ([`Model::bake`]): one parameter per layer, a row for each instance.
     Baked(Vec<usize>),
 }
 
 /// Which parameter is what.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layout {
-    /// Number of instances: latent codes, or 1.
+    /// Number of instances: latent codes, or rows of stored weights.
     pub instances: u32,
     /// Marching steps M.
     pub tracing_steps: u32,
@@ -313,41 +314,62 @@ impl Collector<'_> {
             }
             let blocks = self.mlp(Kind::HyperOutput, &prefix, latent)?;
             let emitted = blocks.last().expect("an MLP has a last layer").out_features;
-            if emitted % (width + 1) != 0 {
-                let expected = format!("in · out + out values for a layer with {width} inputs");
-                return Err(Error::Tensor { name: format!("{prefix} (last layer)"), expected, got: emitted.to_string() });
-            }
-            scene.push((width, emitted / (width + 1)));
-            width = emitted / (width + 1);
+            let out = self.outputs(&format!("{prefix} (last layer)"), width, emitted)?;
+            scene.push((width, out));
+            width = out;
             layers.push(blocks);
         }
     }
 
-    /// The stored layers of a baked model's scene MLP.
+    /// The stored layers of a baked model's scene MLP, `[instances, in · out + out]` each; none in another model.
     fn baked(&mut self) -> Result<Vec<Block>, Error> {
         let mut layers: Vec<Block> = Vec::new();
         loop {
-            let [weight, bias] = ["weight", "bias"].map(|kind| format!("{BAKED}.{}.{kind}", layers.len()));
-            if self.shapes.shape(&weight).is_none() {
+            let name = format!("{BAKED}.{}", layers.len());
+            if self.shapes.shape(&name).is_none() {
                 return Ok(layers);
             }
-            let width = layers.last().map_or(SCENE_INPUT, |layer| layer.out_features);
-            layers.push(self.linear(Kind::Linear, &weight, &bias, width)?);
+            let shape = self.shape(&name, 2)?;
+            if let Some(first) = layers.first() {
+                self.expect(&name, &[self.rows(first.linear), shape[1]])?;
+            }
+            let in_features = layers.last().map_or(SCENE_INPUT, |layer| layer.out_features);
+            let out_features = self.outputs(&name, in_features, shape[1] as u32)?;
+            let linear = self.push(Kind::Linear, vec![(name, shape)]);
+            layers.push(Block { linear, affine: None, in_features, out_features });
         }
+    }
+
+    /// Rows of a parameter.
+    fn rows(&self, parameter: usize) -> usize {
+        self.parameters[parameter].tensors[0].1[0]
+    }
+
+    /// Outputs of a layer of f with so many inputs, of which there are `emitted` weights and biases.
+    fn outputs(&self, name: &str, in_features: u32, emitted: u32) -> Result<u32, Error> {
+        if emitted.is_multiple_of(in_features + 1) {
+            return Ok(emitted / (in_features + 1));
+        }
+        let expected = format!("in · out + out values for a layer with {in_features} inputs");
+        Err(Error::Tensor { name: name.into(), expected, got: emitted.to_string() })
     }
 }
 
 fn collect(shapes: &dyn Shapes, tracing_steps: u32) -> Result<(Layout, Vec<Parameter>), Error> {
     let mut collector = Collector { shapes, parameters: Vec::new() };
     let baked = collector.baked()?;
-    let (source, instances, scene) = if baked.is_empty() {
-        let (hypernetwork, scene) = collector.hypernetwork()?;
-        let instances = collector.parameters[hypernetwork.codes].tensors[0].1[0] as u32;
-        (Source::Hypernetwork(hypernetwork), instances, scene)
-    } else {
-        let scene = baked.iter().map(|layer| (layer.in_features, layer.out_features)).collect();
-        (Source::Baked(baked.iter().map(|layer| layer.linear).collect()), 1, scene)
+    let (source, instances, scene) = match baked.first() {
+        None => {
+            let (hypernetwork, scene) = collector.hypernetwork()?;
+            let instances = collector.rows(hypernetwork.codes);
+            (Source::Hypernetwork(hypernetwork), instances, scene)
+        }
+        Some(first) => {
+            let scene = baked.iter().map(|layer| (layer.in_features, layer.out_features)).collect();
+            (Source::Baked(baked.iter().map(|layer| layer.linear).collect()), collector.rows(first.linear), scene)
+        }
     };
+    let instances = instances as u32;
     let width = scene.last().map_or(SCENE_INPUT, |layer| layer.1);
 
     let lstm = |part: &str| format!("ray_marcher.lstm.{part}");
@@ -455,20 +477,41 @@ impl Model {
         Ok(Model { layout, parameters, metadata })
     }
 
-    /// One instance's networks without codes and hypernetwork: a model with the weights of f that the hypernetwork makes for it.
-    pub fn bake(&self, instance: u32) -> Result<Self, Error> {
+    /// Networks without codes and hypernetwork: a model with the weights of f that the hypernetwork makes for these instances, which get the
+    /// numbers from 0 on.
+    pub fn bake(&self, instances: &[u32]) -> Result<Self, Error> {
         self.hypernetwork()?;
         let is_shared = |name: &str| name != CODES && !name.starts_with(HYPER);
         let shared = self.tensors().into_iter().filter(|(name, ..)| is_shared(name));
         let mut tensors: Tensors = shared.map(|(name, shape, values)| (name, (shape, values.to_vec()))).collect();
-        let weights = renderer::scene_weights(self, instance)?;
-        for ((l, &(width, out)), mut weight) in self.layout.scene.iter().enumerate().zip(weights) {
-            let bias = weight.split_off((width * out) as usize);
-            tensors.insert(format!("{BAKED}.{l}.weight"), (vec![out as usize, width as usize], weight));
-            tensors.insert(format!("{BAKED}.{l}.bias"), (vec![out as usize], bias));
+        for (l, weights) in renderer::scene_weights(self, instances)?.into_iter().enumerate() {
+            tensors.insert(format!("{BAKED}.{l}"), (vec![instances.len(), weights.len() / instances.len()], weights));
         }
-        let metadata = Metadata { instance_names: vec![self.instance_name(instance)], ..self.metadata.clone() };
-        Self::from_tensors(&tensors, self.layout.tracing_steps, metadata)
+        let instance_names = instances.iter().map(|&instance| self.instance_name(instance)).collect();
+        Self::from_tensors(&tensors, self.layout.tracing_steps, Metadata { instance_names, ..self.metadata.clone() })
+    }
+
+    /// The model for work on these instances, and the number of each there: baked where that leaves fewer numbers, for each plan needs all of
+    /// them, at the paper's sizes 200 MB, and makes of them what is the same in all plans.
+    pub(crate) fn for_work_on(&self, instances: &[u32]) -> Result<(Cow<'_, Self>, Vec<u32>), Error> {
+        let as_it_is = || Ok((Cow::Borrowed(self), instances.to_vec()));
+        let Source::Hypernetwork(Hypernetwork { codes, layers, .. }) = &self.layout.source else { return as_it_is() };
+        let mut known = instances.to_vec();
+        known.sort_unstable();
+        known.dedup();
+        // Whoever works on them says what is wrong with them.
+        if known.last().is_none_or(|&last| last >= self.layout.instances) {
+            return as_it_is();
+        }
+        let values = |parameter: usize| self.parameters[parameter].values.len();
+        let of_block = |block: &Block| values(block.linear) + block.affine.map_or(0, values);
+        let whole = values(*codes) + layers.iter().flatten().map(of_block).sum::<usize>();
+        let baked: usize = self.layout.scene.iter().map(|&(width, out)| known.len() * ((width + 1) * out) as usize).sum();
+        if baked >= whole {
+            return as_it_is();
+        }
+        let number = |instance| known.binary_search(instance).expect("it was put there") as u32;
+        Ok((Cow::Owned(self.bake(&known)?), instances.iter().map(number).collect()))
     }
 
     /// Codes and hypernetwork; an error where the model is baked.
@@ -477,7 +520,7 @@ impl Model {
             Source::Hypernetwork(hypernetwork) => Ok(hypernetwork),
             Source::Baked(_) => Err(Error::Input {
                 input: "the model is baked".into(),
-                what: "it has the networks of one instance, but neither codes nor a hypernetwork".into(),
+                what: "it has its instances' networks, but neither codes nor a hypernetwork".into(),
             }),
         }
     }

@@ -183,10 +183,10 @@ impl Renderer {
     }
 }
 
-/// The weights of each layer of f for an instance, `out·in + out` values, computed in `f64`.
-pub(crate) fn scene_weights(model: &Model, instance: u32) -> Result<Vec<Vec<f32>>, Error> {
-    let mut renderer = Renderer::new(&Engine::cpu_f64(), model, 1, 1, 1)?;
-    renderer.set_instances(&[instance])?;
+/// The weights of each layer of f for these instances, `[instances, in·out + out]`, computed in `f64`.
+pub(crate) fn scene_weights(model: &Model, instances: &[u32]) -> Result<Vec<Vec<f32>>, Error> {
+    let mut renderer = Renderer::new(&Engine::cpu_f64(), model, instances.len() as u32, 1, 1)?;
+    renderer.set_instances(instances)?;
     let Renderer { runner, handles, .. } = &mut renderer;
     handles.network.scene.iter().map(|block| Ok(runner.read(block.layer.weights)?)).collect()
 }

@@ -4,7 +4,7 @@ use glam::DMat4;
 use web_time::Instant;
 
 use crate::confidence::{Confidence, Doubt, unexplained, unexplained_doubt};
-use crate::estimator::{Effort, Estimate, Options, Progress, Query, estimate};
+use crate::estimator::{Effort, Estimate, Options, Progress, Query, at_work, estimate};
 use crate::renderer::{View, render_views};
 use crate::unseen::estimate_unseen;
 use crate::{Engine, Error, Model};
@@ -70,7 +70,11 @@ impl Search {
         mut observe: impl FnMut(Progress) -> Result<(), Error>,
     ) -> Result<Vec<Found>, Error> {
         let (first, others) = self.tries()?;
+        let began = Instant::now();
+        let (model, queries) = &at_work(model, queries)?;
+        let before = began.elapsed().as_secs_f64() / queries.len() as f64;
         let mut all = self.once(engine, model, queries, first, &mut observe)?;
+        all.iter_mut().for_each(|found| found.seconds += before);
         for (search, options) in (1..).zip(others) {
             for (i, found) in all.iter_mut().enumerate().filter(|(_, found)| !found.is_trusted()) {
                 let mut again = self.once(engine, model, &queries[i..=i], options, |progress| {

@@ -13,6 +13,12 @@ const WIDEST_RIM: f64 = 2.0;
 /// Follows an object through the frames of a video. A frame that the last pose does not lead to is searched all around.
 #[derive(Clone, Debug)]
 pub struct Tracker {
+    engine: Engine,
+    /// For work on the object.
+    model: Model,
+    /// Its number in the caller's model, and in this one.
+    instance: u32,
+    number: u32,
     search: Search,
     /// The last two poses, the later one first.
     before: Vec<DMat4>,
@@ -29,24 +35,25 @@ pub struct Tracked {
 }
 
 impl Tracker {
-    /// `search` is for the first frame, unless the object's pose there is known, `rough`ly, and for frames in which it was lost. A try that takes
-    /// seconds more is seldom worth it there: the next frame is the second search.
-    pub fn new(search: Search, rough: Option<DMat4>) -> Self {
-        Tracker { search, before: rough.into_iter().collect(), rim: None }
+    /// For frames of an instance of `model`, whose weights are made here, once. `search` is for the first frame, unless the object's pose there is known,
+    /// `rough`ly, and for frames in which it was lost. A try that takes seconds more is seldom worth it there: the next frame is the second search.
+    pub fn new(engine: &Engine, model: &Model, instance: u32, search: Search, rough: Option<DMat4>) -> Result<Self, Error> {
+        let (at_work, numbers) = model.for_work_on(&[instance])?;
+        let (model, number) = (at_work.into_owned(), numbers[0]);
+        Ok(Tracker { engine: engine.clone(), model, instance, number, search, before: rough.into_iter().collect(), rim: None })
     }
 
     /// Finds the pose in the next frame. [`Query::starts`] are where to search if it does not lie near the last pose, all around the object say.
     /// [`Query::dilation`] is not looked at: who cuts frames out does it alike from one to the next, so by how much masks are too small is found out once.
-    pub fn next(
-        &mut self,
-        engine: &Engine,
-        model: &Model,
-        frame: Query,
-        mut observe: impl FnMut(Progress) -> Result<(), Error>,
-    ) -> Result<Tracked, Error> {
+    pub fn next(&mut self, frame: Query, mut observe: impl FnMut(Progress) -> Result<(), Error>) -> Result<Tracked, Error> {
+        if frame.instance != self.instance {
+            let what = format!("shows instance {}, but {} is followed", frame.instance, self.instance);
+            return Err(Error::Input { input: "frame".into(), what });
+        }
+        let (engine, model) = (&self.engine, &self.model);
         let focal = frame.intrinsics.fx;
         let dilation = (self.rim.unwrap_or(0.0) * focal).clamp(-WIDEST_RIM, WIDEST_RIM);
-        let frame = Query { dilation, ..frame };
+        let frame = Query { instance: self.number, dilation, ..frame };
         let near = match self.before[..] {
             [] => None,
             [last] => Some(vec![last]),

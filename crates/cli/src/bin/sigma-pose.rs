@@ -28,7 +28,7 @@ enum Command {
     Calibrate(calibrate::Calibrate),
     /// Render an object from any side.
     Render(render::Render),
-    /// Write one object's networks to a small file of their own, which goes wherever a model goes but into training.
+    /// Write a few objects' networks to a small file of their own, which goes wherever a model goes but into training.
     Bake(bake::Bake),
 }
 

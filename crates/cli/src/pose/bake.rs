@@ -1,4 +1,4 @@
-//! `sigma-pose bake`: one object's networks without the hypernetwork.
+//! `sigma-pose bake`: a few objects' networks without the hypernetwork.
 
 use std::path::PathBuf;
 
@@ -12,10 +12,10 @@ pub struct Bake {
     /// Model, or checkpoint of a training run.
     #[arg(long, value_name = "FILE")]
     model: PathBuf,
-    /// Name or number of the object.
-    #[arg(long, value_name = "NAME")]
-    instance: String,
-    /// The model to write: this object alone.
+    /// Name or number of the object; of several, once for each.
+    #[arg(long, value_name = "NAME", required = true)]
+    instance: Vec<String>,
+    /// The model to write: these objects alone.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Overwrite what is there.
@@ -28,9 +28,11 @@ pub fn run(args: &Bake) -> Result<bool> {
     refuse_to_write(&args.out, args.force)?;
     let model = load_model(&args.model)?;
     let about = |error| about_model(&args.model, error);
-    let baked = model.bake(model.instance(&args.instance).map_err(about)?).map_err(about)?;
+    let instances = args.instance.iter().map(|name| model.instance(name)).collect::<std::result::Result<Vec<_>, _>>();
+    let baked = model.bake(&instances.map_err(about)?).map_err(about)?;
     baked.save(&args.out)?;
     let bytes = std::fs::metadata(&args.out).map_err(|error| format!("{}: {error}", args.out.display()))?.len();
-    print(&format!("{}: {}, {:.2} MB", args.out.display(), baked.instance_name(0), bytes as f64 / 1e6))?;
+    let names: Vec<String> = (0..baked.layout.instances).map(|number| baked.instance_name(number)).collect();
+    print(&format!("{}: {}, {:.2} MB", args.out.display(), names.join(", "), bytes as f64 / 1e6))?;
     Ok(true)
 }

@@ -97,13 +97,13 @@ pub fn run(args: &Track) -> Result<bool> {
             Some(tracker) => tracker,
             none => {
                 let rough = args.rough.as_ref().map(|rough| rough.read(&path, &notation)).transpose()?;
-                none.insert(Tracker::new(args.search.single(args.search.options()?), rough))
+                let search = args.search.single(args.search.options()?);
+                none.insert(Tracker::new(&engine, &model, picture.instance, search, rough)?)
             }
         };
         count += 1;
         let frame = query(&picture, side, &starts);
-        let Tracked { found, is_searched: searched } =
-            with_cooperative_said(&engine, || Ok(tracker.next(&engine, &model, frame, |_| Ok(()))?))?;
+        let Tracked { found, is_searched: searched } = with_cooperative_said(&engine, || Ok(tracker.next(frame, |_| Ok(()))?))?;
         trusted = found.is_trusted();
         // In pixels of the frame.
         let frame_pixels = picture.pixels_on_disk(side);

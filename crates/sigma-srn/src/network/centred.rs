@@ -54,7 +54,10 @@ fn maps(layout: &Layout) -> Vec<Map> {
             }
         }
         Source::Baked(stored) => {
-            maps.extend(stored.iter().zip(&layout.scene).map(|(&number, &(ins, outs))| Map::of_layer(number, ins, outs)));
+            maps.extend(stored.iter().zip(&layout.scene).map(|(&number, &(ins, outs))| {
+                let of_one = Map::of_layer(number, ins, outs);
+                Map { columns: of_one.columns.repeat(layout.instances as usize), ..of_one }
+            }));
         }
     }
     let with_norm = blocks.into_iter().filter(|block| block.affine.is_some());

@@ -37,11 +37,12 @@ impl Instances {
                 }
                 stage
             }
-            // A table with one row, each slot's index 0.
+            // A table as that of the codes is.
             SourceBuffers::Baked(stored) => {
                 let stage = b.stage("instances");
                 for (&stored, scene) in stored.iter().zip(&network.scene) {
-                    let table = Embedding { batch: network.batch.slots, instances: 1, latent: scene.layer.parameters() };
+                    let (batch, instances) = (network.batch.slots, network.instances);
+                    let table = Embedding { batch, instances, latent: scene.layer.parameters() };
                     embedding::forward(b, table, stored, network.index, scene.layer.weights)?;
                 }
                 stage

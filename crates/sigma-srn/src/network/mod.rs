@@ -77,7 +77,7 @@ pub(crate) struct HyperBuffers {
 #[derive(Debug)]
 pub(crate) enum SourceBuffers {
     Hypernetwork(HyperBuffers),
-    /// Stored weights of each layer of f.
+    /// Stored weights of each layer of f, a row for each instance.
     Baked(Vec<BufferId>),
 }
 
