@@ -723,4 +723,9 @@ fn a_baked_model_is_a_model() {
     fail(dir, "bake --model chicken.safetensors --instance 0 --out more.safetensors", &["chicken.safetensors", "is baked"]);
     run(dir, &format!("{bake} seat --out chicken.safetensors --force"), 0);
     fail(dir, &format!("estimate DATA/{CHICKEN} --model chicken.safetensors"), &["`chicken`", "1 instances: seat"]);
+    // Two of three, in another order than they had.
+    let line = run(dir, &format!("{bake} seat --instance bucket --out two.safetensors"), 0);
+    assert!(line.contains("two.safetensors: seat, bucket, 0.0"), "{line}");
+    let model = Model::load(&dir.join("two.safetensors")).unwrap();
+    assert_eq!((model.instance("seat").unwrap(), model.instance("bucket").unwrap(), model.layout.instances), (0, 1, 2));
 }

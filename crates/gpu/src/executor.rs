@@ -1,4 +1,5 @@
-use std::cell::OnceCell;
+use std::cell::{OnceCell, RefCell};
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytemuck::Pod;
@@ -66,6 +67,7 @@ impl GpuExecutor {
         })?;
         let params = Params::upload(gpu, plan.stages.iter().flat_map(|stage| &stage.steps))?;
         let mut offsets = params.offsets.iter().copied();
+        let pipelines = Pipelines::default();
         let mut stages = Vec::new();
         for stage in &plan.stages {
             let mut launches = Vec::with_capacity(stage.steps.len());
@@ -74,9 +76,9 @@ impl GpuExecutor {
                 let params = params.binding(step, offsets.next().unwrap_or_default());
                 let scratch = Scratch::default();
                 let variant = gpu.chooser().choose(gpu, step, |variant, extent| {
-                    launch(gpu, step, variant, extent, &scratch.instead_of_outputs(gpu, step, &bound)?, &params)
+                    launch(gpu, &pipelines, step, variant, extent, &scratch.instead_of_outputs(gpu, step, &bound)?, &params)
                 })?;
-                launches.push(launch(gpu, step, variant, step.extent, &bound, &params)?);
+                launches.push(launch(gpu, &pipelines, step, variant, step.extent, &bound, &params)?);
             }
             stages.push(launches);
         }
@@ -198,9 +200,13 @@ fn encode(launches: &[Launch], label: &str, encoder: &mut wgpu::CommandEncoder) 
     launches.iter().for_each(|launch| launch.dispatch(&mut pass));
 }
 
+/// The pipelines of a plan by their labels: the device knows them by their whole texts, which are long, and a plan has a thousand steps.
+type Pipelines = RefCell<HashMap<String, Arc<Pipeline>>>;
+
 /// Makes one dispatch: `bound` has a buffer for each binding of the kernel, `extent` is the step's or a part of it.
 fn launch(
     gpu: &Gpu,
+    pipelines: &Pipelines,
     step: &Step,
     variant: &Variant,
     extent: [u32; 3],
@@ -212,7 +218,15 @@ fn launch(
     let grid = launch::grid(extent, variant.tile, most).ok_or_else(|| ExecutorError::Device {
         what: format!("{label}: extent {extent:?} in tiles of {:?} needs more than {most} workgroups", variant.tile),
     })?;
-    let pipeline = gpu.pipeline(step.kernel, variant)?;
+    let known = pipelines.borrow().get(&label).cloned();
+    let pipeline = match known {
+        Some(pipeline) => pipeline,
+        None => {
+            let made = gpu.pipeline(step.kernel, variant)?;
+            pipelines.borrow_mut().insert(label.clone(), made.clone());
+            made
+        }
+    };
     let entry = |&(binding, slot): &(u32, Slot)| wgpu::BindGroupEntry {
         binding,
         resource: match slot {

@@ -276,7 +276,8 @@ pub fn estimate(
         descent.evaluate()?;
         descent.gradients()
     };
-    engine.prove("gradients of poses", |engine| {
+    let work = if model.layout.is_baked() { "gradients of poses of baked objects" } else { "gradients of poses" };
+    engine.prove(work, |engine| {
         // As many of them from one start alone.
         let around = |h: &Hypothesis| {
             let at = |matrix: DMat4| Hypothesis { pose: Pose6::from_matrix(&matrix), ..*h };

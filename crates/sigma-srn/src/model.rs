@@ -89,6 +89,11 @@ impl Layout {
         self.scene.last().map_or(0, |layer| layer.1)
     }
 
+    /// Whether the weights of f are stored, so that plans need no kernels that make them.
+    pub(crate) fn is_baked(&self) -> bool {
+        matches!(self.source, Source::Baked(_))
+    }
+
     /// Size of the LSTM's hidden state.
     pub fn lstm_size(&self) -> u32 {
         self.lstm_hidden.in_features

@@ -77,7 +77,8 @@ impl Renderer {
                 return Err(Error::Setting { field, what: "must be at least 1".into() });
             }
         }
-        engine.prove("views", |engine| {
+        let work = if model.layout.is_baked() { "views of baked objects" } else { "views" };
+        engine.prove(work, |engine| {
             const TRIED: usize = 3;
             let (side, middle) = (proof::SIDE, f64::from(proof::SIDE) / 2.0);
             let intrinsics = Intrinsics { fx: f64::from(side), fy: f64::from(side), cx: middle, cy: middle, pixel_center: 0.0 };
