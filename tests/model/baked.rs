@@ -25,8 +25,9 @@ fn it_renders_the_same() {
     for whole in [model(true), model(false), short] {
         // Weights are computed in f64 and rounded once; worst: 1.1e-7 on cpu64, 1.2e-6 on llvmpipe.
         for engine in [Engine::cpu_f64(), Engine::cpu(), Engine::gpu(gpu().clone())] {
-            let baked = whole.bake(&[0, WHICH]).unwrap();
-            let [whole, baked] = [(&whole, [0, WHICH, 0]), (&baked, [0, 1, 0])].map(|(model, instances)| {
+            // More than are made at once.
+            let baked = whole.bake(&[0, 1, 0, 1, 0, 1, 0, 1, WHICH]).unwrap();
+            let [whole, baked] = [(&whole, [0, WHICH, 0]), (&baked, [0, 8, 2])].map(|(model, instances)| {
                 Renderer::new(&engine, model, 3, SIZE[0], SIZE[1]).unwrap().render(&instances, &cameras, 7).unwrap()
             });
             for (name, got, want) in [("rgb", baked.rgb, whole.rgb), ("depth", baked.depth, whole.depth)] {

@@ -26,7 +26,7 @@ pub struct Rendering {
 /// Instance, `world_from_camera` and intrinsics of a view.
 pub type View = (u32, DMat4, Intrinsics);
 
-/// Views of [`render_views`] that are rendered at once.
+/// Views that are rendered at once, and instances whose weights are made.
 const BATCH: usize = 8;
 
 /// Renders any number of views of `[width, height]` pixels.
@@ -35,8 +35,7 @@ pub fn render_views(engine: &Engine, model: &Model, [width, height]: [u32; 2], v
     let mut renderer = Renderer::new(engine, model, batch as u32, width, height)?;
     let mut renders = Vec::new();
     for chunk in views.chunks(batch) {
-        // The renderer's size is fixed: the last batch is filled up with copies.
-        let filled: Vec<View> = chunk.iter().cycle().take(batch).copied().collect();
+        let filled = filled(chunk, batch);
         let instances: Vec<u32> = filled.iter().map(|view| view.0).collect();
         let cameras: Vec<_> = filled.iter().map(|view| (view.1, view.2)).collect();
         let Rendering { rgb, depth } = renderer.render(&instances, &cameras, 0)?;
@@ -184,12 +183,25 @@ impl Renderer {
     }
 }
 
-/// The weights of each layer of f for these instances, `[instances, in·out + out]`, computed in `f64`.
+/// The weights of each layer of f for these instances, `[instances, in·out + out]`, computed in `f64`, a few at a time.
 pub(crate) fn scene_weights(model: &Model, instances: &[u32]) -> Result<Vec<Vec<f32>>, Error> {
-    let mut renderer = Renderer::new(&Engine::cpu_f64(), model, instances.len() as u32, 1, 1)?;
-    renderer.set_instances(instances)?;
-    let Renderer { runner, handles, .. } = &mut renderer;
-    handles.network.scene.iter().map(|block| Ok(runner.read(block.layer.weights)?)).collect()
+    let batch = instances.len().min(BATCH);
+    let mut renderer = Renderer::new(&Engine::cpu_f64(), model, batch as u32, 1, 1)?;
+    let mut weights = vec![Vec::new(); model.layout.scene.len()];
+    for chunk in instances.chunks(batch) {
+        renderer.set_instances(&filled(chunk, batch))?;
+        let Renderer { runner, handles, .. } = &mut renderer;
+        for (weights, block) in weights.iter_mut().zip(&handles.network.scene) {
+            let slots = runner.read(block.layer.weights)?;
+            weights.extend_from_slice(&slots[..chunk.len() * (slots.len() / batch)]);
+        }
+    }
+    Ok(weights)
+}
+
+/// The items, and copies of them up to `count`: a renderer's size is fixed, what is left at the end is fewer.
+fn filled<T: Copy>(items: &[T], count: usize) -> Vec<T> {
+    items.iter().cycle().take(count).copied().collect()
 }
 
 fn build(
