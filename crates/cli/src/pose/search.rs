@@ -202,7 +202,7 @@ impl SearchArgs {
         Ok(Search { accept: self.accept, ..search })
     }
 
-    /// The first of them alone, or one with other settings.
+    /// One alone, with these settings and the same limit of acceptance.
     pub fn single(&self, options: Options) -> Search {
         Search { accept: self.accept, ..options.into() }
     }
