@@ -655,7 +655,8 @@ fn a_mask_need_not_be_exact() {
     let lines = run(dir, &format!("{args} --rough {TEST}/valve/pose/000005.txt"), 0);
     let frames: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let rim = |frame: &Value| frame["mask_dilation_px"].as_f64().unwrap();
-    assert!(rim(&frames[0]) < -0.7 && rim(&frames[1]) == rim(&frames[0]), "{lines}");
+    // It is kept as a part of the distance.
+    assert!(rim(&frames[0]) < -0.7 && (rim(&frames[1]) - rim(&frames[0])).abs() < 1e-9, "{lines}");
     assert_eq!([&frames[0]["searched"], &frames[1]["searched"]], [false; 2]);
 }
 

@@ -7,13 +7,14 @@ use srn_shaders::{
     RaysParams,
 };
 
+use crate::aligned::Aligned;
 use crate::chain::{Chain, Link, RowWise, Share, Split};
 use crate::{Real, chain, hidden_layer, ops};
 
 /// The values of one buffer.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 enum Storage<T> {
-    F(Vec<T>),
+    F(Aligned<T>),
     U(Vec<u32>),
 }
 
@@ -23,10 +24,10 @@ impl<T> Default for Storage<T> {
     }
 }
 
-impl<T> Storage<T> {
+impl<T: Real> Storage<T> {
     fn f(&self) -> &[T] {
         match self {
-            Storage::F(values) => values,
+            Storage::F(values) => values.values(),
             Storage::U(_) => unreachable!("the builder checks element types"),
         }
     }
@@ -40,7 +41,7 @@ impl<T> Storage<T> {
 
     fn f_mut(&mut self) -> &mut [T] {
         match self {
-            Storage::F(values) => values,
+            Storage::F(values) => values.values_mut(),
             Storage::U(_) => unreachable!("the builder checks element types"),
         }
     }
@@ -55,7 +56,7 @@ impl<T> Storage<T> {
     /// All values, to read.
     fn whole(&self) -> Part<'_, T> {
         match self {
-            Storage::F(values) => Part::F(values),
+            Storage::F(values) => Part::F(values.values()),
             Storage::U(values) => Part::U(values),
         }
     }
@@ -63,7 +64,7 @@ impl<T> Storage<T> {
     /// All values, to write.
     fn whole_mut(&mut self) -> Part<'_, T> {
         match self {
-            Storage::F(values) => Part::FMut(values),
+            Storage::F(values) => Part::FMut(values.values_mut()),
             Storage::U(values) => Part::UMut(values),
         }
     }
@@ -192,7 +193,7 @@ impl<T: Real> CpuExecutor<T> {
             .buffers
             .iter()
             .map(|buffer| match buffer.element {
-                Element::F32 => Storage::F(vec![T::zero(); buffer.len]),
+                Element::F32 => Storage::F(Aligned::zeros(buffer.len)),
                 Element::U32 => Storage::U(vec![0; buffer.len]),
             })
             .collect();

@@ -23,7 +23,7 @@ pub(crate) fn forward<T: Real>(
     linear::with_forward(p, weights, slots, 0, |at_a_time, layer| {
         for rows in parts(z.len() / outs, at_a_time) {
             let z = &mut z[rows.start * outs..rows.end * outs];
-            layer(&x.unwrap_or(y)[rows.start * ins..rows.end * ins], z);
+            layer(&x.unwrap_or(y)[rows.start * ins..rows.end * ins], z, &[]);
             let stats = &mut stats[2 * rows.start..2 * rows.end];
             layer_norm_relu::forward(norm.block(rows.clone()), z, affine, &mut y[rows.start * outs..rows.end * outs], stats);
         }
@@ -49,7 +49,7 @@ pub(crate) fn backward<T: Real>(
         for rows in parts(z.len() / ins, at_a_time) {
             let values = rows.start * ins..rows.end * ins;
             let (z, d_y, stats) = (&z[values.clone()], &mut d_y[values.clone()], &stats[2 * rows.start..2 * rows.end]);
-            layer(&d_after.unwrap_or(d_z)[rows.start * outs..rows.end * outs], d_y);
+            layer(&d_after.unwrap_or(d_z)[rows.start * outs..rows.end * outs], d_y, z);
             layer_norm_relu::backward_input(norm.block(rows), z, stats, affine, d_y, &mut d_z[values]);
         }
     });
@@ -117,6 +117,8 @@ mod tests {
             ([130, 64, 64], true),
             ([50, 48, 80], false),
             ([13, 272, 96], false),
+            ([55, 256, 256], true),
+            ([7, 528, 64], false),
             ([9, 20, 24], false),
             ([7, 24, 40], false),
         ];

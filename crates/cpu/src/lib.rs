@@ -4,10 +4,11 @@
 //! In `f64` it is the oracle that the WGSL kernels are tested against; in `f32`, threaded, it is the fallback for a machine
 //! without a GPU. The functions in [`ops`] take the parameter struct of the kernel and plain slices, inputs before outputs.
 
+mod aligned;
 mod chain;
 mod executor;
 mod hidden_layer;
-mod narrow;
+mod layer;
 pub mod ops;
 mod real;
 mod simd;

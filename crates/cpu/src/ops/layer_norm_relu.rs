@@ -84,6 +84,22 @@ fn rows_of<S: Simd, const V: usize>(values: &[f32]) -> &[[S::f32s; V]] {
     S::as_simd_f32s(values).0.as_chunks().0
 }
 
+/// Sums that take turns, so that none waits for the one before.
+const SUMS: usize = 4;
+/// Vectors that surely stay in registers.
+const FEW: usize = 4;
+
+/// What they add up to where a row has `V` vectors.
+#[inline(always)]
+fn total<S: Simd, const V: usize>(simd: S, [a, b, c, d]: [S::f32s; SUMS]) -> f32 {
+    simd.reduce_sum_f32s(match V {
+        1 => a,
+        2 => simd.add_f32s(a, b),
+        3 => simd.add_f32s(simd.add_f32s(a, b), c),
+        _ => simd.add_f32s(simd.add_f32s(a, b), simd.add_f32s(c, d)),
+    })
+}
+
 /// [`forward`] with the processor's vectors, for rows of so many that they stay in registers.
 struct Forward<'a, const CENTRED: bool> {
     x: &'a [f32],
@@ -97,26 +113,31 @@ impl<const CENTRED: bool> Rows for Forward<'_, CENTRED> {
     fn run<S: Simd, const V: usize>(self, simd: S) {
         let inverse = 1.0 / (V * S::F32_LANES) as f32;
         let zero = simd.splat_f32s(0.0);
-        let [gamma, beta] = *rows_of::<S, V>(self.affine) else { unreachable!("two rows") };
+        let [gamma, beta] = rows_of::<S, V>(self.affine) else { unreachable!("two rows") };
         let y = S::as_mut_simd_f32s(self.y).0.as_chunks_mut::<V>().0;
-        for ((&x, y), stats) in rows_of::<S, V>(self.x).iter().zip(y).zip(self.stats.as_chunks_mut().0) {
-            let (mut sum, mut squares, mut centred) = (zero, zero, x);
+        for ((x, y), stats) in rows_of::<S, V>(self.x).iter().zip(y).zip(self.stats.as_chunks_mut().0) {
             let mut mean = 0.0;
             if !CENTRED {
-                for v in 0..V {
-                    sum = simd.add_f32s(sum, x[v]);
+                let mut sums = [zero; SUMS];
+                for first in (0..V).step_by(SUMS) {
+                    for (sum, v) in sums.iter_mut().zip(first..V) {
+                        *sum = simd.add_f32s(*sum, x[v]);
+                    }
                 }
-                mean = simd.reduce_sum_f32s(sum) * inverse;
-                for v in 0..V {
-                    centred[v] = simd.sub_f32s(x[v], simd.splat_f32s(mean));
+                mean = total::<S, V>(simd, sums) * inverse;
+            }
+            let means = simd.splat_f32s(mean);
+            let mut squares = [zero; SUMS];
+            for first in (0..V).step_by(SUMS) {
+                for (sum, v) in squares.iter_mut().zip(first..V) {
+                    let centred = if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) };
+                    *sum = simd.mul_add_e_f32s(centred, centred, *sum);
                 }
             }
+            let rstd = 1.0 / (total::<S, V>(simd, squares) * inverse + EPSILON as f32).sqrt();
             for v in 0..V {
-                squares = simd.mul_add_e_f32s(centred[v], centred[v], squares);
-            }
-            let rstd = 1.0 / (simd.reduce_sum_f32s(squares) * inverse + EPSILON as f32).sqrt();
-            for v in 0..V {
-                let normalised = simd.mul_f32s(centred[v], simd.splat_f32s(rstd));
+                let centred = if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) };
+                let normalised = simd.mul_f32s(centred, simd.splat_f32s(rstd));
                 let value = simd.mul_add_e_f32s(normalised, gamma[v], beta[v]);
                 // In this order a NaN goes on.
                 y[v] = simd.max_f32s(zero, value);
@@ -178,27 +199,31 @@ impl<const CENTRED: bool> Rows for Backward<'_, CENTRED> {
     fn run<S: Simd, const V: usize>(self, simd: S) {
         let inverse = 1.0 / (V * S::F32_LANES) as f32;
         let zero = simd.splat_f32s(0.0);
-        let [gamma, beta] = *rows_of::<S, V>(self.affine) else { unreachable!("two rows") };
+        let [gamma, beta] = rows_of::<S, V>(self.affine) else { unreachable!("two rows") };
         let d_x = S::as_mut_simd_f32s(self.d_x).0.as_chunks_mut::<V>().0;
         let rows = rows_of::<S, V>(self.x).iter().zip(self.stats.as_chunks().0).zip(rows_of::<S, V>(self.d_y)).zip(d_x);
-        for (((&x, &[mean, rstd]), d_y), d_x) in rows {
+        for (((x, &[mean, rstd]), d_y), d_x) in rows {
             let (means, rstds) = (simd.splat_f32s(mean), simd.splat_f32s(rstd));
-            let (mut sum, mut along, mut normalised, mut e) = (zero, zero, x, x);
-            for v in 0..V {
-                normalised[v] = simd.mul_f32s(if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) }, rstds);
-                let live = simd.greater_than_f32s(simd.mul_add_e_f32s(normalised[v], gamma[v], beta[v]), zero);
-                e[v] = simd.select_f32s(live, simd.mul_f32s(gamma[v], d_y[v]), zero);
-                if !CENTRED {
-                    sum = simd.add_f32s(sum, e[v]);
+            let (mut sums, mut along, mut es) = ([zero; SUMS], [zero; SUMS], [zero; FEW]);
+            for first in (0..V).step_by(SUMS) {
+                for ((sum, along), v) in sums.iter_mut().zip(&mut along).zip(first..V) {
+                    let normalised = simd.mul_f32s(if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) }, rstds);
+                    let live = simd.greater_than_f32s(simd.mul_add_e_f32s(normalised, gamma[v], beta[v]), zero);
+                    let e = simd.select_f32s(live, simd.mul_f32s(gamma[v], d_y[v]), zero);
+                    if !CENTRED {
+                        *sum = simd.add_f32s(*sum, e);
+                    }
+                    *along = simd.mul_add_e_f32s(e, normalised, *along);
+                    if V <= FEW { es[v] = e } else { d_x[v] = e }
                 }
-                along = simd.mul_add_e_f32s(e[v], normalised[v], along);
             }
-            let mean_e = if CENTRED { zero } else { simd.splat_f32s(simd.reduce_sum_f32s(sum) * inverse) };
-            let mean_along = simd.splat_f32s(simd.reduce_sum_f32s(along) * inverse);
+            let mean_e = if CENTRED { zero } else { simd.splat_f32s(total::<S, V>(simd, sums) * inverse) };
+            let mean_along = simd.splat_f32s(total::<S, V>(simd, along) * inverse);
             for v in 0..V {
-                let e = if CENTRED { e[v] } else { simd.sub_f32s(e[v], mean_e) };
-                let d = simd.negate_mul_add_e_f32s(normalised[v], mean_along, e);
-                d_x[v] = simd.mul_f32s(rstds, d);
+                let normalised = simd.mul_f32s(if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) }, rstds);
+                let e = if V <= FEW { es[v] } else { d_x[v] };
+                let e = if CENTRED { e } else { simd.sub_f32s(e, mean_e) };
+                d_x[v] = simd.mul_f32s(rstds, simd.negate_mul_add_e_f32s(normalised, mean_along, e));
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Linear layers: wide ones through a matrix library, narrow ones through `narrow.rs`.
+//! Linear layers: blocks of rows through `layer.rs`, where it can, all else through a matrix library.
 
 use gemm::{Parallelism, gemm};
 use srn_shaders::LinearParams;
@@ -6,7 +6,7 @@ use srn_shaders::LinearParams;
 use super::set_of;
 use crate::Real;
 use crate::chain::is_alone;
-use crate::narrow::{self, Begin, Weights};
+use crate::layer::{self, Begin, Weights};
 use crate::simd::vectorised;
 
 /// A matrix as the library wants it: values and the distances between rows and between columns.
@@ -55,25 +55,25 @@ fn threads() -> Parallelism {
     if is_alone() { Parallelism::None } else { Parallelism::Rayon(0) }
 }
 
-/// A product for rows that a layer is ready for: inputs and outputs, or gradients of both the other way.
-pub(crate) type Rows<'a, T> = &'a dyn Fn(&[T], &mut [T]);
+/// A product for rows that a layer is ready for: inputs and outputs, or gradients of both the other way, and what will be wanted after it.
+pub(crate) type Rows<'a, T> = &'a dyn Fn(&[T], &mut [T], &[T]);
 
 /// Rows that are best taken at a time where something else is to be done with them, too: as many as stay in the first cache with their
 /// weights, or all where putting the weights in order costs as much again each time.
 const FEW_ROWS: usize = 48;
 const ALL_ROWS: usize = usize::MAX;
 
-/// Whether a narrow layer's product is better done here than by the matrix library; that one also works on all threads.
-fn is_narrow<T: Real>(ins: usize, outs: usize) -> bool {
-    is_alone() && T::singles(&[]).is_some() && narrow::is_for(ins, outs)
+/// Whether `layer.rs` makes the product. The matrix library also works on all threads.
+fn is_ours<T: Real>(ins: usize, outs: usize) -> bool {
+    is_alone() && T::singles(&[]).is_some() && layer::is_for(ins, outs)
 }
 
 fn singles<T: Real>(values: &[T]) -> &[f32] {
-    T::singles(values).expect("`is_narrow` saw that they are")
+    T::singles(values).expect("`is_ours` saw that they are")
 }
 
 fn singles_mut<T: Real>(values: &mut [T]) -> &mut [f32] {
-    T::singles_mut(values).expect("`is_narrow` saw that they are")
+    T::singles_mut(values).expect("`is_ours` saw that they are")
 }
 
 /// `work` with `y (+)= x Wᵀ + b` for rows of group `group`, and with how many to take at a time.
@@ -92,18 +92,18 @@ pub(crate) fn with_forward<T: Real>(
             y.iter_mut().zip(bias).for_each(|(y, &b)| *y += b);
         }
     };
-    if is_narrow::<T>(ins, outs) {
-        return narrow::with_layer(ins, outs, Weights::OutputsByInputs(singles(weight)), |layer| {
-            work(FEW_ROWS, &|x, y| {
+    if is_ours::<T>(ins, outs) {
+        return layer::with_layer(ins, outs, Weights::OutputsByInputs(singles(weight)), |layer| {
+            work(FEW_ROWS, &|x, y, soon| {
                 if accumulate {
                     add_bias(y);
                 }
                 let begin = if accumulate { Begin::Before } else { Begin::Bias(singles(bias)) };
-                layer.product(singles(x), ins, begin, singles_mut(y));
+                layer.product(singles(x), ins, begin, singles_mut(y), singles(soon));
             });
         });
     }
-    work(ALL_ROWS, &|x, y| {
+    work(ALL_ROWS, &|x, y, _| {
         match accumulate {
             true => add_bias(y),
             false => y.chunks_exact_mut(outs).for_each(|y| y.copy_from_slice(bias)),
@@ -124,13 +124,15 @@ pub(crate) fn with_backward_input<T: Real>(
     let [first, end] = [p.first_out as usize, p.end_out as usize];
     let weight = &weights_of(p, weights, slots, group)[first * ins..end * ins];
     let accumulate = p.accumulate == 1;
-    if is_narrow::<T>(end - first, ins) {
+    if is_ours::<T>(end - first, ins) {
         let begin = if accumulate { Begin::Before } else { Begin::Zero };
-        return narrow::with_layer(end - first, ins, Weights::InputsByOutputs(singles(weight)), |layer| {
-            work(FEW_ROWS, &|d_y, d_x| layer.product(&singles(d_y)[first..], outs, begin, singles_mut(d_x)));
+        return layer::with_layer(end - first, ins, Weights::InputsByOutputs(singles(weight)), |layer| {
+            work(FEW_ROWS, &|d_y, d_x, soon| {
+                layer.product(&singles(d_y)[first..], outs, begin, singles_mut(d_x), singles(soon));
+            });
         });
     }
-    work(ALL_ROWS, &|d_y, d_x| {
+    work(ALL_ROWS, &|d_y, d_x, _| {
         let size = [d_x.len() / ins, ins, end - first];
         product(size, d_x, Matrix(&d_y[first..], [outs, 1]), Matrix(weight, [ins, 1]), accumulate, threads());
     });
@@ -141,7 +143,7 @@ pub fn forward<T: Real>(p: LinearParams, x: &[T], weights: &[T], slots: &[u32], 
     let [rows, ins, outs] = [p.rows_per_group, p.in_features, p.out_features].map(|size| size as usize);
     let groups = y.chunks_exact_mut(rows * outs).zip(x.chunks_exact(rows * ins));
     for (group, (y, x)) in groups.enumerate().take(p.groups as usize) {
-        with_forward(p, weights, slots, group, |_, rows| rows(x, y));
+        with_forward(p, weights, slots, group, |_, rows| rows(x, y, &[]));
     }
 }
 
@@ -150,7 +152,7 @@ pub fn backward_input<T: Real>(p: LinearParams, d_y: &[T], weights: &[T], slots:
     let [rows, ins, outs] = [p.rows_per_group, p.in_features, p.out_features].map(|size| size as usize);
     let groups = d_x.chunks_exact_mut(rows * ins).zip(d_y.chunks_exact(rows * outs));
     for (group, (d_x, d_y)) in groups.enumerate().take(p.groups as usize) {
-        with_backward_input(p, weights, slots, group, |_, rows| rows(d_y, d_x));
+        with_backward_input(p, weights, slots, group, |_, rows| rows(d_y, d_x, &[]));
     }
 }
 

@@ -1,14 +1,17 @@
-//! Products of blocks of rows with the weights of a narrow layer: sums stay in the processor's registers and begin with the bias. Wide
-//! layers are the matrix library's, which is as fast there.
+//! Products of blocks of rows with the weights of a layer: sums stay in the processor's registers and begin with the bias.
 
 use std::cell::RefCell;
 
 use pulp::{Arch, Simd, WithSimd};
 
+use crate::aligned::{Aligned, LINE};
+
 /// Inputs at a time: their weights for as many outputs as have their sums in registers stay in the first cache.
 const DEPTH: usize = 128;
 /// Rows whose sums are held at once.
 const ROWS: usize = 6;
+/// Inputs and outputs, at most. Wider layers are the matrix library's: putting their weights in order for some rows would cost too much.
+const WIDEST: usize = 512;
 /// Inputs in a turn of the loop; vectors are as long or longer.
 const AT_A_TIME: usize = 4;
 
@@ -43,9 +46,8 @@ pub(crate) enum Weights<'a> {
 pub(crate) struct Layer<'a> {
     ins: usize,
     outs: usize,
-    /// `[ins, outs]`, or one such matrix after the other, each for the next [`columns`] outputs.
+    /// Weights to the first [`columns`] outputs `[ins, columns]`, then those to the next.
     values: &'a [f32],
-    in_columns: bool,
 }
 
 /// Values of a vector of this processor.
@@ -72,42 +74,52 @@ fn columns() -> usize {
 /// Whether there are products with such layers here.
 pub(crate) fn is_for(ins: usize, outs: usize) -> bool {
     let lanes = lanes();
-    vectors(lanes) > 0 && ins.min(outs) <= DEPTH && ins.is_multiple_of(lanes) && outs.is_multiple_of(lanes)
+    vectors(lanes) > 0 && ins.max(outs) <= WIDEST && ins.is_multiple_of(lanes) && outs.is_multiple_of(lanes)
 }
 
 /// Works with a layer for which [`is_for`] holds.
 pub(crate) fn with_layer(ins: usize, outs: usize, weights: Weights, work: impl FnOnce(&Layer)) {
     thread_local! {
-        static TRANSPOSED: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+        static IN_ORDER: RefCell<Aligned<f32>> = RefCell::new(Aligned::zeros(0));
     }
     assert!(is_for(ins, outs));
-    match weights {
-        Weights::InputsByOutputs(values) => work(&Layer { ins, outs, values: &values[..ins * outs], in_columns: false }),
-        Weights::OutputsByInputs(values) => TRANSPOSED.with_borrow_mut(|transposed| {
-            let values = &values[..ins * outs];
-            if transposed.len() < values.len() {
-                transposed.resize(values.len(), 0.0);
-            }
-            let length = columns() * ins;
-            for (from, to) in values.chunks(length).zip(transposed.chunks_mut(length)) {
-                transpose(from, ins, to);
-            }
-            work(&Layer { ins, outs, values: transposed, in_columns: true });
-        }),
+    let (length, columns) = (ins * outs, columns());
+    if let Weights::InputsByOutputs(values) = weights
+        && outs <= columns
+    {
+        return work(&Layer { ins, outs, values: &values[..length] });
     }
+    IN_ORDER.with_borrow_mut(|in_order| {
+        if in_order.values().len() < length {
+            *in_order = Aligned::zeros(length);
+        }
+        let in_order = &mut in_order.values_mut()[..length];
+        for (first, to) in (0..outs).step_by(columns).zip(in_order.chunks_mut(columns * ins)) {
+            let columns = to.len() / ins;
+            match weights {
+                Weights::OutputsByInputs(values) => transpose(&values[first * ins..][..columns * ins], ins, to),
+                Weights::InputsByOutputs(values) => {
+                    for (from, to) in values[..length].chunks_exact(outs).zip(to.chunks_exact_mut(columns)) {
+                        to.copy_from_slice(&from[first..first + columns]);
+                    }
+                }
+            }
+        }
+        work(&Layer { ins, outs, values: in_order });
+    });
 }
 
 impl Layer<'_> {
-    /// `y [rows, outs] = begin + x w`, rows of `x` being `stride` values apart.
-    pub(crate) fn product(&self, x: &[f32], stride: usize, begin: Begin, y: &mut [f32]) {
-        let &Layer { ins, outs, values, in_columns } = self;
+    /// `y [rows, outs] = begin + x w`, rows of `x` being `stride` values apart. What lies in `soon` is asked for meanwhile.
+    pub(crate) fn product(&self, x: &[f32], stride: usize, begin: Begin, y: &mut [f32], soon: &[f32]) {
+        let &Layer { ins, outs, values } = self;
         let rows = y.len() / outs;
         assert!(rows > 0 && y.len() == rows * outs && stride >= ins && x.len() >= (rows - 1) * stride + ins);
         assert!(!matches!(begin, Begin::Bias(bias) if bias.len() < outs));
         let most = columns();
         for out in (0..outs).step_by(most) {
             let columns = most.min(outs - out);
-            let (w, w_stride) = if in_columns { (&values[out * ins..], columns) } else { (&values[out..], outs) };
+            let w = &values[out * ins..];
             for first in (0..ins).step_by(DEPTH) {
                 let depth = DEPTH.min(ins - first);
                 let begin = match begin {
@@ -115,10 +127,11 @@ impl Layer<'_> {
                     Begin::Zero if first == 0 => Begin::Zero,
                     _ => Begin::Before,
                 };
-                let (x, w, y) = (&x[first..], &w[first * w_stride..], &mut y[out..]);
+                let soon = if out == 0 && first == 0 { soon } else { &[] };
+                let (x, w, y) = (&x[first..], &w[first * columns..], &mut y[out..]);
                 // By the assertions here and in `with_layer` there are `rows` rows of `x` and `y`, and `depth` of `w`, that far apart, the
                 // last with all the values that the others have; a bias has `columns` values.
-                Arch::new().dispatch(Block { rows, columns, depth, x, x_stride: stride, w, w_stride, begin, y, y_stride: outs });
+                Arch::new().dispatch(Block { rows, columns, depth, x, x_stride: stride, w, begin, y, y_stride: outs, soon });
             }
         }
     }
@@ -132,10 +145,10 @@ struct Block<'a> {
     x: &'a [f32],
     x_stride: usize,
     w: &'a [f32],
-    w_stride: usize,
     begin: Begin<'a>,
     y: &'a mut [f32],
     y_stride: usize,
+    soon: &'a [f32],
 }
 
 impl WithSimd for Block<'_> {
@@ -158,7 +171,9 @@ impl Block<'_> {
     #[inline(always)]
     fn run<S: Simd, const V: usize>(mut self, simd: S) {
         let whole = self.rows - self.rows % ROWS;
+        let mut soon = self.soon.chunks((self.soon.len() * ROWS).div_ceil(self.rows).max(1));
         for row in (0..whole).step_by(ROWS) {
+            soon.next().into_iter().for_each(ask_for);
             self.sums::<S, ROWS, V>(simd, row);
         }
         match self.rows - whole {
@@ -174,7 +189,7 @@ impl Block<'_> {
     /// `R` rows from `row` on.
     #[inline(always)]
     fn sums<S: Simd, const R: usize, const V: usize>(&mut self, simd: S, row: usize) {
-        let &mut Block { depth, x_stride, w_stride, begin, y_stride, .. } = self;
+        let &mut Block { columns, depth, x_stride, begin, y_stride, .. } = self;
         assert!(row + R <= self.rows);
         // SAFETY: see `Layer::product`, and `is_for` for the last turn of the loop.
         unsafe {
@@ -195,7 +210,7 @@ impl Block<'_> {
                 for k in first..first + AT_A_TIME {
                     let mut weights = [simd.splat_f32s(0.0); V];
                     for v in 0..V {
-                        weights[v] = vector(w.add(k * w_stride), v).read_unaligned();
+                        weights[v] = vector(w.add(k * columns), v).read_unaligned();
                     }
                     for r in 0..R {
                         let x = simd.splat_f32s(*x.add(r * x_stride + k));
@@ -213,6 +228,21 @@ impl Block<'_> {
         }
     }
 }
+
+/// Has values brought to the second cache: the first is full of weights and rows. Every processor of this kind has SSE.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn ask_for(values: &[f32]) {
+    use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+    for line in values.chunks(LINE / size_of::<f32>()) {
+        // SAFETY: nothing is read.
+        unsafe { _mm_prefetch::<_MM_HINT_T1>(line.as_ptr().cast()) }
+    }
+}
+
+/// Others have no stable way to ask.
+#[cfg(not(target_arch = "x86_64"))]
+fn ask_for(_: &[f32]) {}
 
 /// `to [ins, outs] = from [outs, ins]ᵀ`, both sizes multiples of four.
 fn transpose(from: &[f32], ins: usize, to: &mut [f32]) {
