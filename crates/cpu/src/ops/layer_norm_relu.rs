@@ -86,18 +86,11 @@ fn rows_of<S: Simd, const V: usize>(values: &[f32]) -> &[[S::f32s; V]] {
 
 /// Sums that take turns, so that none waits for the one before.
 const SUMS: usize = 4;
-/// Vectors that surely stay in registers.
-const FEW: usize = 4;
 
-/// What they add up to where a row has `V` vectors.
+/// What they add up to.
 #[inline(always)]
-fn total<S: Simd, const V: usize>(simd: S, [a, b, c, d]: [S::f32s; SUMS]) -> f32 {
-    simd.reduce_sum_f32s(match V {
-        1 => a,
-        2 => simd.add_f32s(a, b),
-        3 => simd.add_f32s(simd.add_f32s(a, b), c),
-        _ => simd.add_f32s(simd.add_f32s(a, b), simd.add_f32s(c, d)),
-    })
+fn total<S: Simd>(simd: S, [a, b, c, d]: [S::f32s; SUMS]) -> f32 {
+    simd.reduce_sum_f32s(simd.add_f32s(simd.add_f32s(a, b), simd.add_f32s(c, d)))
 }
 
 /// [`forward`] with the processor's vectors, for rows of so many that they stay in registers.
@@ -124,7 +117,7 @@ impl<const CENTRED: bool> Rows for Forward<'_, CENTRED> {
                         *sum = simd.add_f32s(*sum, x[v]);
                     }
                 }
-                mean = total::<S, V>(simd, sums) * inverse;
+                mean = total(simd, sums) * inverse;
             }
             let means = simd.splat_f32s(mean);
             let mut squares = [zero; SUMS];
@@ -134,7 +127,7 @@ impl<const CENTRED: bool> Rows for Forward<'_, CENTRED> {
                     *sum = simd.mul_add_e_f32s(centred, centred, *sum);
                 }
             }
-            let rstd = 1.0 / (total::<S, V>(simd, squares) * inverse + EPSILON as f32).sqrt();
+            let rstd = 1.0 / (total(simd, squares) * inverse + EPSILON as f32).sqrt();
             for v in 0..V {
                 let centred = if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) };
                 let normalised = simd.mul_f32s(centred, simd.splat_f32s(rstd));
@@ -185,6 +178,9 @@ vectorised! {
     }
 }
 
+/// Vectors of `e` that surely stay in registers.
+const FEW: usize = 4;
+
 /// [`backward_input`] with the processor's vectors, as [`Forward`].
 struct Backward<'a, const CENTRED: bool> {
     x: &'a [f32],
@@ -217,8 +213,8 @@ impl<const CENTRED: bool> Rows for Backward<'_, CENTRED> {
                     if V <= FEW { es[v] = e } else { d_x[v] = e }
                 }
             }
-            let mean_e = if CENTRED { zero } else { simd.splat_f32s(total::<S, V>(simd, sums) * inverse) };
-            let mean_along = simd.splat_f32s(total::<S, V>(simd, along) * inverse);
+            let mean_e = if CENTRED { zero } else { simd.splat_f32s(total(simd, sums) * inverse) };
+            let mean_along = simd.splat_f32s(total(simd, along) * inverse);
             for v in 0..V {
                 let normalised = simd.mul_f32s(if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) }, rstds);
                 let e = if V <= FEW { es[v] } else { d_x[v] };
