@@ -7,6 +7,7 @@ use glam::DMat4;
 use serde::Serialize;
 
 use crate::camera::{Intrinsics, Pose6};
+use crate::confidence::motion;
 use crate::descent::{Descent, Loss, Method, Shape};
 use crate::engine::{Engine, proof};
 use crate::light::Light;
@@ -18,6 +19,10 @@ use crate::{Error, Rays, pixel_grid};
 
 /// How far starts are turned that the search adds. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
 const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
+
+/// How far apart two hypotheses are at most that have met: a turn about each axis (rad) and a shift along it (object units), a tenth of a pixel
+/// of 64. What is left of the search takes both to the same minimum.
+const MET: f64 = 1e-3;
 
 /// Hypotheses that a GPU, and cooperative matrices, are tried on.
 const TRIED: usize = 8;
@@ -56,14 +61,15 @@ pub struct Phase {
     /// Every how many pixels, in both directions, a ray is cast; with BFGS only near what the image or the view from a hypothesis's pose at the
     /// beginning of the phase shows: where both are white nothing is to be seen.
     pub stride: u32,
-    /// How many hypotheses of each image enter this phase: those with the lowest loss.
+    /// How many hypotheses of each image enter this phase: those with the lowest loss, and of several that have come to the same pose the best
+    /// alone. `usize::MAX`: all.
     pub keep: usize,
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`] is known: see [`Light`]. From wrong
     /// poses the light looks wrong, too.
     pub light: bool,
     /// Whether masks are tried dilated and eroded by up to two pixels beside [`Query::dilation`], where [`Query::coverage`] is known, with the
     /// best `keep` hypotheses; later phases compare with the one that leaves the least loss, see [`Estimate::dilation`]. Other hypotheses and
-    /// other images wait: none is dropped.
+    /// other images wait: none is dropped for it.
     pub dilate: bool,
 }
 
@@ -298,6 +304,9 @@ pub fn estimate(
             let mut own: Vec<Hypothesis> =
                 hypotheses.iter().copied().filter(|h| h.query == query && h.phases == number).collect();
             own.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+            if phase.keep < usize::MAX {
+                rest.extend(split_off_met(&mut own));
+            }
             let keep = if phase.dilate && !can_dilate(&queries[query]) { 0 } else { phase.keep };
             let mut others = own.split_off(keep.min(own.len()));
             if phase.dilate {
@@ -399,6 +408,17 @@ pub(crate) fn at_work<'a>(model: &'a Model, queries: &'a [Query]) -> Result<(Cow
     }
     let numbered = zip(queries, numbers).map(|(query, instance)| Query { instance, ..query.clone() });
     Ok((at_work, numbered.collect()))
+}
+
+/// Takes those out of a query's hypotheses, the best first, that have come to where a better one stands.
+fn split_off_met(own: &mut Vec<Hypothesis>) -> Vec<Hypothesis> {
+    let mut met = Vec::new();
+    for hypothesis in std::mem::take(own) {
+        let here = hypothesis.pose.to_matrix();
+        let is_here = |better: &Hypothesis| motion(&better.pose.to_matrix(), &here).iter().all(|by| by.abs() < MET);
+        if own.iter().any(is_here) { &mut met } else { &mut *own }.push(hypothesis);
+    }
+    met
 }
 
 fn is_gmsd(method: Method) -> bool {
@@ -664,6 +684,23 @@ mod tests {
             let (degrees, _) = crate::camera::pose_error(&start, &truth);
             assert!(degrees > 5.0, "{degrees}°");
         }
+    }
+
+    #[test]
+    fn of_hypotheses_that_have_met_the_best_goes_on() {
+        let truth = crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
+        let turned = |angle: f64| DMat4::from_axis_angle(glam::DVec3::Y, angle) * truth;
+        let shifted = |by: f64| DMat4::from_translation(by * glam::DVec3::Z) * truth;
+        let poses = [truth, turned(9e-4), turned(1.5e-3), shifted(9e-4), shifted(2e-3), turned(1.6e-3), turned(3.0)];
+        let new = |(start, pose)| {
+            let pose = Pose6::from_matrix(pose);
+            Hypothesis { query: 0, start, pose, loss: start as f64, curvature: None, phases: 1, dilation: 0.0 }
+        };
+        let mut own: Vec<Hypothesis> = poses.iter().enumerate().map(new).collect();
+        own.push(Hypothesis { pose: Pose6([f64::NAN; 6]), start: 7, loss: f64::INFINITY, ..own[0] });
+        let met = split_off_met(&mut own);
+        let starts = |of: &[Hypothesis]| of.iter().map(|h| h.start).collect::<Vec<_>>();
+        assert_eq!((starts(&own), starts(&met)), (vec![0, 2, 4, 6, 7], vec![1, 3, 5]));
     }
 
     #[test]

@@ -95,10 +95,12 @@ impl Tracker {
     /// The next pose is near; what would have to be found from afar is searched for all around instead.
     fn near(&self) -> Result<Search, Error> {
         let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, dilate: false };
-        let mut phases = vec![phase(5, 2, 2), Phase { dilate: true, ..phase(5, 2, 1) }, phase(3, 1, 1)];
-        if self.rim.is_some() || self.before.len() > 1 {
-            phases.remove(1);
-        }
+        let phases = match (&self.before[..], self.rim) {
+            // A look says whether it stands still or goes on.
+            ([_, _, ..], _) => vec![phase(0, 4, 2), phase(3, 2, 1), phase(4, 1, 1)],
+            (_, Some(_)) => vec![phase(5, 2, 1), phase(3, 1, 1)],
+            (_, None) => vec![phase(5, 2, 1), Phase { dilate: true, ..phase(5, 2, 1) }, phase(3, 1, 1)],
+        };
         let (first, _) = self.search.tries()?;
         let options = Options { phases, min_starts: 0, ..first.clone() };
         Ok(Search { tries: vec![options], accept: self.search.accept })
