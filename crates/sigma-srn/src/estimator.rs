@@ -13,7 +13,7 @@ use crate::engine::{Engine, proof};
 use crate::light::Light;
 use crate::mask::{DILATIONS, best_dilation, dilated, has_outline};
 use crate::model::Model;
-use crate::random::{initial_depths, stream};
+use crate::random::{MEAN_DEPTH, initial_depths, stream};
 use crate::region::region;
 use crate::{Error, Rays, pixel_grid};
 
@@ -83,7 +83,8 @@ pub struct Options {
     pub min_starts: usize,
     /// Phases, one after the other.
     pub phases: Vec<Phase>,
-    /// Seed of the initial depths.
+    /// Seed of the initial depths of Adam's rays. With BFGS all begin at the mean depth: random ones change the losses of hypotheses by a
+    /// thousandth, as much as those of minima side by side differ.
     pub seed: u64,
 }
 
@@ -327,7 +328,7 @@ pub fn estimate(
         (descent, lights) = prepare(engine, model, queries, options, phase, is_moving, &running)?;
         let rows = running.len() * rays_of(&queries[0], phase.stride).count();
         for _ in 0..phase.steps {
-            // New depths in every step, as in the paper; but whether BFGS keeps a step must not depend on luck.
+            // New depths in every step, as in the paper.
             if matches!(options.method, Method::Adam { .. }) {
                 let mut random = stream(options.seed, 1 + u64::from(step));
                 descent.set_initial_depths(&initial_depths(&mut random, rows))?;
@@ -483,11 +484,11 @@ struct Targets {
 
 impl Targets {
     /// On the whole grid of a phase.
-    fn new(queries: &[Query], phase: &Phase, running: &[Hypothesis], seed: u64) -> Self {
+    fn new(queries: &[Query], options: &Options, phase: &Phase, running: &[Hypothesis]) -> Self {
         let mut instances: Vec<u32> = running.iter().map(|h| queries[h.query].instance).collect();
         instances.sort_unstable();
         instances.dedup();
-        let mut random = stream(seed, 0);
+        let mut random = stream(options.seed, 0);
         let (mut slots, mut rays, mut rgb, mut weights) = (Vec::new(), Rays::default(), Vec::new(), Vec::new());
         for hypothesis in running {
             let query = &queries[hypothesis.query];
@@ -496,6 +497,9 @@ impl Targets {
             let (colours, _) = seen(query, hypothesis.dilation);
             pixels_of(query, phase.stride).for_each(|pixel| rgb.extend_from_slice(&colours[3 * pixel..][..3]));
             weights.extend(weights_of(query, phase.stride));
+        }
+        if matches!(options.method, Method::Bfgs { .. }) {
+            rays.z0.fill(MEAN_DEPTH);
         }
         let across = |size: u32| (phase.stride / 2..size).step_by(phase.stride as usize).count() as u32;
         let shape = Shape {
@@ -584,7 +588,7 @@ fn prepare(
     is_moving: bool,
     running: &[Hypothesis],
 ) -> Result<(Descent, Vec<Option<Light>>), Error> {
-    let mut targets = Targets::new(queries, phase, running, options.seed);
+    let mut targets = Targets::new(queries, options, phase, running);
     let mut lights = vec![None; queries.len()];
     let makes_up = phase.light && queries.iter().any(|query| query.coverage.is_some());
     // The paper's way compares whole images.

@@ -5,8 +5,10 @@ use rand::{RngExt, SeedableRng};
 /// The generator.
 pub type Random = rand_pcg::Pcg64;
 
-/// Standard deviation and mean of the initial depth along z (spec 2).
+/// Mean and standard deviation of the initial depth along z (spec 2).
 const Z0: (f64, f64) = (0.05, 5e-4);
+/// The mean alone.
+pub(crate) const MEAN_DEPTH: f32 = Z0.0 as f32;
 
 /// The stream of a seed and a step: same arguments, same numbers.
 pub fn stream(seed: u64, step: u64) -> Random {

@@ -58,7 +58,7 @@ pub struct SearchArgs {
     /// gradients of the first starts are compared with those in f32, which is said; beyond 1 % of the largest, f32 it is.
     #[arg(long)]
     cooperative: bool,
-    /// Decides the random initial depths of the rays.
+    /// Decides the random initial depths of the rays: of `--preset paper`, and where the code of an unknown object is fitted.
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// A pose is trusted if the view from there leaves at most this part of the picture unexplained: the sum of absolute differences, over
