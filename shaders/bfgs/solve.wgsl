@@ -1,12 +1,14 @@
-// B ξ = -g, shortened to the radius; (ω, υ) = ξ, E = exp(ω): R' = R E, t' = R (E Rᵀt + υ).
+// B ξ = -g, shortened to the radius, to whole grains; (ω, υ) = ξ, E = exp(ω): R' = R E, t' = R (E Rᵀt + υ).
 // One invocation solves for one pose, by Cholesky's factors; ξ goes along -g where B is not positive.
 // state [B, 47] → world_from_camera [B, 12].
 // OVERWRITES world_from_camera and the step in state.
 
-// ξ turns and shifts the camera about the world's origin, in the camera's axes.
+// ξ turns and shifts the camera about the world's origin, in the camera's axes. Its six numbers are rounded to multiples of the grain, if there is
+// one: steps that differ in their last digits then lead to the same pose.
 
 struct Params {
     poses: u32,
+    grain: f32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -64,6 +66,9 @@ fn main(
     let factor = min(1.0, state[at + STATE_RADIUS] / size);
     for (var i = 0u; i < 6u; i++) {
         xi[i] = select(0.0, factor * xi[i], usable);
+        if (params.grain > 0.0) {
+            xi[i] = params.grain * round(xi[i] / params.grain);
+        }
         state[at + STATE_STEP + i] = xi[i];
     }
     let turn = vec3(xi[0], xi[1], xi[2]);

@@ -56,10 +56,17 @@ macro_rules! params {
 }
 
 params! {
-    /// `pose/*`, `bfgs/*` but for `equations`: number of poses.
+    /// `pose/*`, `bfgs/*` but for `equations` and `solve`: number of poses.
     PoseParams {
         /// Number of poses.
         poses: u32,
+    }
+    /// `bfgs/solve`.
+    SolveParams {
+        /// Number of poses.
+        poses: u32,
+        /// Of which steps are multiples; 0: they have any length.
+        grain: f32,
     }
     /// `rays/*`: rows of a tile and the images they belong to.
     RaysParams {

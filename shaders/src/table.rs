@@ -223,8 +223,8 @@ table! {
     /// What a trial says: second derivatives from the change of the gradient, the best pose, how long steps may be. Extent: poses.
     BFGS_UPDATE = "bfgs"/"update", PoseParams, tile FLAT,
         (gradient: f32, loss: f32, world_from_camera: f32) -> (state: f32);
-    /// The next trial: `B ξ = -g`, shortened to the radius, the best pose moved by `ξ`. Extent: poses.
-    BFGS_SOLVE = "bfgs"/"solve", PoseParams, tile FLAT,
+    /// The next trial: `B ξ = -g`, shortened to the radius, to whole grains, the best pose moved by `ξ`. Extent: poses.
+    BFGS_SOLVE = "bfgs"/"solve", SolveParams, tile FLAT,
         () -> (world_from_camera: f32, state: f32);
     /// RGB in `[-1,1]` to packed RGBA8 (r in the low byte, alpha 255), clamped and rounded: `rgb [.., 3]` → `packed [height, stride]`. Extent: width · height.
     PACK_RGBA8_FORWARD = "pack_rgba8"/"forward", PackParams, tile FLAT,

@@ -145,7 +145,7 @@ fn run() -> Result<()> {
         for bench in &benches {
             works.push(bench.pose_step(ADAM, BATCH, SIDE)?);
             if width == 64 {
-                works.push(bench.pose_step(Method::Bfgs { soft: 0.3 }, BATCH, SIDE)?);
+                works.push(bench.pose_step(Method::Bfgs { soft: 0.3, grain: 0.0 }, BATCH, SIDE)?);
             }
             works.push(bench.picture()?);
         }

@@ -96,6 +96,9 @@ pub static SOLVE: KernelTest = KernelTest {
             "vec3(state[p + 3u], state[p + 7u], state[p + 11u]) * r",
             "r * vec3(state[p + 3u], state[p + 7u], state[p + 11u])",
         ),
+        ("solve", "params.grain > 0.0", "false"),
+        ("solve", "params.grain * round", "2.0 * params.grain * round"),
+        ("solve", "round(", "floor("),
         ("solve", "STATE * number", "12u * number"),
     ],
 };
@@ -241,12 +244,12 @@ fn update_case(poses: u32) -> Case {
 }
 
 fn solve() -> Vec<Case> {
-    [1, 7, 129].map(solve_case).into()
+    [(1, 0.0), (7, 0.0), (129, 0.0), (7, 1.0 / 4096.0), (7, 0.01)].map(solve_case).into()
 }
 
-/// Steps from tiny to too long; the third matrix is not positive, the fourth gradient is zero.
-fn solve_case(poses: u32) -> Case {
-    let mut s = Sketch::new(format!("{poses} poses"));
+/// Steps from tiny to too long, of any length or of whole grains; the third matrix is not positive, the fourth gradient is zero.
+fn solve_case((poses, grain): (u32, f32)) -> Case {
+    let mut s = Sketch::new(format!("{poses} poses, grain {grain}"));
     let n = poses as usize;
     let mut states = states(&mut s, n);
     for (pose, state) in states.chunks_mut(STATE as usize).enumerate() {
@@ -260,6 +263,6 @@ fn solve_case(poses: u32) -> Case {
     }
     let state = s.input("state", states);
     let world_from_camera = s.scratch("world_from_camera", 12 * n);
-    s.step(|b| bfgs::solve(b, poses, world_from_camera, state));
+    s.step(|b| bfgs::solve(b, poses, grain, world_from_camera, state));
     s.finish()
 }

@@ -45,7 +45,7 @@ fn it_leads_the_same_way() {
     for engine in [Engine::cpu(), Engine::gpu(gpu().clone())] {
         let [whole, baked] = baked(true).map(|(model, instance)| {
             let shape = Shape { hypotheses: 3, width: SIZE[0], height: SIZE[1], instances: 1 };
-            let mut descent = Descent::new(&engine, &model, shape, Method::Bfgs { soft: 0.3 }).unwrap();
+            let mut descent = Descent::new(&engine, &model, shape, Method::Bfgs { soft: 0.3, grain: 0.0 }).unwrap();
             descent.set_targets(&[instance], &[0; 3], &batch.rays, &batch.target_rgb, None).unwrap();
             descent.set_poses(&poses(3)).unwrap();
             descent.evaluate().unwrap();
@@ -94,7 +94,7 @@ fn every_kernel_of_its_plan_is_right() {
     let shape = Shape { hypotheses: 3, width: SIZE[0], height: SIZE[1], instances: 2 };
     let batch = batch(3);
     let [mut subject, mut reference] = engines().map(|engine| {
-        let mut descent = Descent::new(&engine, &model, shape, Method::Bfgs { soft: 0.3 }).unwrap();
+        let mut descent = Descent::new(&engine, &model, shape, Method::Bfgs { soft: 0.3, grain: 0.0 }).unwrap();
         descent.set_targets(&[0, 0], &[0, 1, 1], &batch.rays, &batch.target_rgb, None).unwrap();
         descent.set_poses(&poses(3)).unwrap();
         descent.evaluate().unwrap();

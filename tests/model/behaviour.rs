@@ -129,7 +129,7 @@ fn poses_near_the_truth_come_nearer() {
         let rendering = Renderer::new(&engine, model, 24, SIDE, SIDE).unwrap().render(&shown, &cameras, 0).unwrap();
 
         let shape = Shape { hypotheses: 24, width: SIDE, height: SIDE, instances: 2 };
-        let mut descent = Descent::new(&engine, model, shape, Method::Bfgs { soft: 1.0 }).unwrap();
+        let mut descent = Descent::new(&engine, model, shape, Method::Bfgs { soft: 1.0, grain: 0.0 }).unwrap();
         let mut rays = Rays::default();
         let mut random = stream(0, 0);
         truths.iter().for_each(|truth| rays.push(truth, &intrinsics(), pixel_grid(SIDE, SIDE, 1), &mut random));
@@ -181,7 +181,7 @@ fn light_is_made_up_for() {
             let (coverage, starts) = (is_known.then_some(coverage), vec![turn * truths[k]]);
             Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
         };
-        let phases = [6, 6].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, dilate: false }).into();
+        let phases = [10, 10].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, dilate: false }).into();
         let options = Options { phases, min_starts: 0, ..Options::default() };
         let search = |queries: &[Query]| estimate(&engine, model, queries, &options, |_| Ok(())).unwrap();
         let [unknown, known] = [false, true].map(|is_known| search(&[0, 1, 2].map(|k| query(k, is_known))));
@@ -191,8 +191,8 @@ fn light_is_made_up_for() {
         });
         let contrasts: Vec<f32> = known.iter().map(|found| found.light.unwrap().contrast).collect();
         println!("{engine}: {errors:.2?}°, without it {off:.2?}°; contrasts {contrasts:.2?}");
-        // Measured: 0.11° at most, where without it all together are 1.9° off and more.
-        assert!(errors.iter().all(|error| *error < 0.25), "{engine}");
+        // Measured: 0.06° at most, where without it all together are 1.8° off.
+        assert!(errors.iter().all(|error| *error < 0.15), "{engine}");
         assert!(off.iter().sum::<f64>() > 4.0 * errors.iter().sum::<f64>(), "{engine}");
         assert!(contrasts.iter().all(|contrast| (contrast - 2.0).abs() < 0.15), "{engine}");
 
@@ -414,6 +414,36 @@ fn hypotheses_of_one_pose_have_one_loss() {
     }
 }
 
+/// What rounding does to a picture's last digits hardly ever changes where its search ends: steps come in whole grains. Steps of any length grow apart.
+#[test]
+fn rounding_does_not_part_searches() {
+    const SIDE: u32 = 28;
+    let (ref model, instance, intrinsics) = shipped_forklift();
+    let engine = Engine::cpu();
+    let truths = camera::fixed24(1.3);
+    let cameras: Vec<_> = truths.iter().map(|truth| (*truth, intrinsics)).collect();
+    let shown = Renderer::new(&engine, model, 24, SIDE, SIDE).unwrap().render(&[instance; 24], &cameras, 0).unwrap().rgb;
+    let query = |k: usize, by: f32| {
+        let rgb = shown.chunks(shown.len() / 24).nth(k).unwrap().iter().map(|c| (by * c).clamp(-1.0, 1.0)).collect();
+        let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.3);
+        let starts = vec![turn * truths[k]];
+        Query { instance, rgb, weights: None, coverage: None, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
+    };
+    let together = |grain: f32| {
+        let options = Options { method: Method::Bfgs { soft: 0.3, grain }, min_starts: 0, ..Options::default() };
+        let search = |by: f32| {
+            let queries: Vec<Query> = (0..24).map(|k| query(k, by)).collect();
+            estimate(&engine, model, &queries, &options, |_| Ok(())).unwrap()
+        };
+        let pairs = zip(search(1.0), search(1.0 - 2e-7));
+        pairs.filter(|(a, b)| camera::pose_error(&a.pose.to_matrix(), &b.pose.to_matrix()).0 < 1e-4).count()
+    };
+    let Method::Bfgs { grain, .. } = Options::default().method else { unreachable!("the default is BFGS") };
+    let (ours, without) = (together(grain), together(0.0));
+    println!("{ours} of 24 end together, with steps of any length {without}");
+    assert!(ours >= 18 && without <= 12, "{ours} {without}");
+}
+
 /// Where neither the picture nor the view shows anything, no rays are cast: the loss is that of the whole picture all the same, and hypotheses that show
 /// more of the object do not disturb those that show less.
 #[test]
@@ -488,7 +518,7 @@ fn what_does_not_count_has_no_influence() {
         starts: camera::neighbor4(&truth),
     };
     let adam = |loss| Method::Adam { loss, learning_rate: 0.01 };
-    let methods = [Loss::Mae, Loss::NormL2].map(adam).into_iter().chain([Method::Bfgs { soft: 0.3 }]);
+    let methods = [Loss::Mae, Loss::NormL2].map(adam).into_iter().chain([Method::Bfgs { soft: 0.3, grain: 0.0 }]);
     for method in methods {
         let phases = [(2, 4), (1, 2)].map(|(stride, keep)| Phase { steps: 3, stride, keep, light: false, dilate: false }).into();
         let options = Options { method, min_starts: 0, phases, seed: 0 };

@@ -63,7 +63,7 @@ fn trainer(engine: &Engine, model: Model, train: Train, images: u32) -> Trainer 
 /// Every way to move: the paper's with every loss, and BFGS.
 fn methods() -> Vec<Method> {
     let adam = |loss| Method::Adam { loss, learning_rate: 0.01 };
-    LOSSES.into_iter().map(adam).chain([Method::Bfgs { soft: 0.3 }]).collect()
+    LOSSES.into_iter().map(adam).chain([Method::Bfgs { soft: 0.3, grain: 0.0 }]).collect()
 }
 
 /// Rays that count more, less, and not at all; GMSD counts all.

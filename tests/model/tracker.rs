@@ -5,7 +5,7 @@ use sigma_srn::{Doubt, Effort, Engine, Intrinsics, Options, Query, Renderer, Sea
 
 use super::behaviour::{shipped_forklift, with_rim};
 
-/// Of 28 pixels, a frame that follows one five degrees before it is found more than a degree off in one of ten cases; of 64, in one of a hundred.
+/// With frames of 28 pixels one of ten that follow another five degrees away is found more than a degree off, of 64 one of a hundred.
 const SIDE: u32 = 56;
 
 /// A camera that goes about the object by five degrees, jumps to another side, and goes on from there.

@@ -24,6 +24,9 @@ const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
 /// of 64. What is left of the search takes both to the same minimum.
 const MET: f64 = 1e-3;
 
+/// What steps at every pixel are multiples of, in radians and object units: a sixtieth of a pixel of 64 at most, and a number that sums of it are exact of.
+const GRAIN: f32 = 1.0 / 4096.0;
+
 /// Hypotheses that a GPU, and cooperative matrices, are tried on.
 const TRIED: usize = 8;
 
@@ -121,7 +124,7 @@ impl Options {
         let phase = |((stride, light, dilate), (steps, keep))| Phase { steps, stride, keep, light, dilate };
         let kinds = [(4, false, false), (2, false, false), (2, true, true), (1, true, false), (1, true, false)];
         phases.extend(zip(kinds, descents).map(phase));
-        Options { method: Method::Bfgs { soft: 0.3 }, min_starts, phases, seed: 0 }
+        Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, phases, seed: 0 }
     }
 
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
@@ -589,12 +592,13 @@ fn prepare(
     running: &[Hypothesis],
 ) -> Result<(Descent, Vec<Option<Light>>), Error> {
     let mut targets = Targets::new(queries, options, phase, running);
+    let method = options.method.with_stride(phase.stride);
     let mut lights = vec![None; queries.len()];
     let makes_up = phase.light && queries.iter().any(|query| query.coverage.is_some());
     // The paper's way compares whole images.
-    let looks_closer = phase.steps > 0 && matches!(options.method, Method::Bfgs { .. });
+    let looks_closer = phase.steps > 0 && matches!(method, Method::Bfgs { .. });
     if makes_up || looks_closer {
-        let mut views = targets.descent(engine, model, options.method, false, running)?;
+        let mut views = targets.descent(engine, model, method, false, running)?;
         views.compare()?;
         let renders = views.rgb()?;
         if makes_up {
@@ -604,7 +608,7 @@ fn prepare(
             targets = targets.in_regions(&renders).unwrap_or(targets);
         }
     }
-    Ok((targets.descent(engine, model, options.method, is_moving, running)?, lights))
+    Ok((targets.descent(engine, model, method, is_moving, running)?, lights))
 }
 
 fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Error> {

@@ -1,7 +1,7 @@
 //! Descent over a motion `ξ = (ω, υ)` about the object, in the camera's axes: second derivatives `B` from the residuals of all rays at first,
 //! from the change of gradients after (Broyden, Fletcher, Goldfarb, Shanno); the steps, and whether they are kept.
 
-use srn_shaders::{EquationsParams, PoseParams};
+use srn_shaders::{EquationsParams, PoseParams, SolveParams};
 
 use super::chunk_of;
 use super::rays::beginning;
@@ -157,11 +157,12 @@ pub fn update<T: Real>(p: PoseParams, gradient: &[T], loss: &[T], world_from_cam
 }
 
 /// The step from each best pose.
-pub fn solve<T: Real>(p: PoseParams, world_from_camera: &mut [T], state: &mut [T]) {
+pub fn solve<T: Real>(p: SolveParams, world_from_camera: &mut [T], state: &mut [T]) {
     for (number, out) in world_from_camera.chunks_exact_mut(12).take(p.poses as usize).enumerate() {
         let state = &mut state[STATE * number..STATE * (number + 1)];
         let values: Vec<f64> = state.iter().map(|value| value.wide()).collect();
-        let xi = next_step(&values);
+        let whole = |x: f64| if p.grain > 0.0 { f64::from(p.grain) * (x / f64::from(p.grain)).round_ties_even() } else { x };
+        let xi = next_step(&values).map(whole);
         state[STEP..RADIUS].iter_mut().zip(xi).for_each(|(state, xi)| *state = T::of(xi));
         let (turn, shift) = ([xi[0], xi[1], xi[2]], [xi[3], xi[4], xi[5]]);
         let [x, y, z, t] = columns(&state[POSE..STEP]);

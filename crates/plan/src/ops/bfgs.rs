@@ -1,6 +1,6 @@
 //! Poses by descent with second derivatives: from the residuals of every ray at first, then from the change of the gradient.
 
-use srn_shaders::{BFGS_BEGIN, BFGS_EQUATIONS, BFGS_GRADIENT, BFGS_SOLVE, BFGS_UPDATE, EquationsParams, PoseParams};
+use srn_shaders::{BFGS_BEGIN, BFGS_EQUATIONS, BFGS_GRADIENT, BFGS_SOLVE, BFGS_UPDATE, EquationsParams, PoseParams, SolveParams};
 
 use super::{overwrite, read, size, sum, update as update_of};
 use crate::{BufferId, Builder, PlanError, Rows};
@@ -154,8 +154,8 @@ pub fn update(
     b.step(&BFGS_UPDATE, PoseParams { poses }, &args, [poses, 1, 1], 100, 0)
 }
 
-/// The next trial, `world_from_camera [poses,12]`.
-pub fn solve(b: &mut Builder, poses: u32, world_from_camera: BufferId, state: BufferId) -> Result<(), PlanError> {
+/// The next trial, `world_from_camera [poses,12]`. Steps are multiples of `grain`; 0: of any length.
+pub fn solve(b: &mut Builder, poses: u32, grain: f32, world_from_camera: BufferId, state: BufferId) -> Result<(), PlanError> {
     let args = [overwrite(world_from_camera, size([poses, 12])), update_of(state, size([poses, STATE]))];
-    b.step(&BFGS_SOLVE, PoseParams { poses }, &args, [poses, 1, 1], 6 * 6 * 6, 0)
+    b.step(&BFGS_SOLVE, SolveParams { poses, grain }, &args, [poses, 1, 1], 6 * 6 * 6, 0)
 }
