@@ -86,7 +86,7 @@ pub struct Options {
     pub min_starts: usize,
     /// Phases, one after the other.
     pub phases: Vec<Phase>,
-    /// Seed of the initial depths of Adam's rays. With BFGS all begin at the mean depth: random ones change the losses of hypotheses by a
+    /// Seed of the initial depths of Adam's rays. With BFGS all begin at the mean depth: random ones change the losses of hypotheses by half a
     /// thousandth, as much as those of minima side by side differ.
     pub seed: u64,
 }
