@@ -66,6 +66,11 @@ impl Pose6 {
         DVec3::new(x, y, z).length()
     }
 
+    /// The turn between two poses in degrees.
+    pub fn degrees_from(self, other: Pose6) -> f64 {
+        pose_error(&self.to_matrix(), &other.to_matrix()).0
+    }
+
     /// As the kernels take it.
     pub fn to_f32(self) -> [f32; 6] {
         self.0.map(|value| value as f32)

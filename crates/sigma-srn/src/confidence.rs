@@ -145,7 +145,7 @@ impl Calibration {
 pub const WITHIN_95: f64 = 12.591_587;
 
 /// How far apart poses are that are not the same minimum: a turn about the object in degrees.
-const ELSEWHERE_DEG: f64 = 10.0;
+pub(crate) const ELSEWHERE_DEG: f64 = 10.0;
 
 /// The motion `(ω, υ)` about the object that takes one pose to another, in the axes of the first one's camera: the camera turned about the
 /// object's centre by `ω` (radians), then shifted by `υ` (object units).
@@ -227,11 +227,8 @@ impl Estimate {
     /// The best of the other starts that went as far as the winner, but to a pose elsewhere, and by which part its loss is higher.
     pub fn rival(&self) -> Option<(&Ranked, f64)> {
         let winner = self.ranking.first()?;
-        let is_elsewhere = |other: &&Ranked| {
-            let [a, b, c, ..] = motion(&winner.pose.to_matrix(), &other.pose.to_matrix());
-            other.phases == winner.phases && DVec3::new(a, b, c).length().to_degrees() > ELSEWHERE_DEG
-        };
-        let rival = self.ranking[1..].iter().find(is_elsewhere)?;
+        let is_rival = |other: &&Ranked| other.phases == winner.phases && winner.pose.degrees_from(other.pose) > ELSEWHERE_DEG;
+        let rival = self.ranking[1..].iter().find(is_rival)?;
         Some((rival, rival.loss / self.loss - 1.0))
     }
 }
