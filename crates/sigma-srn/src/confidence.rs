@@ -145,7 +145,7 @@ impl Calibration {
 pub const WITHIN_95: f64 = 12.591_587;
 
 /// How far apart poses are that are not the same minimum: a turn about the object in degrees.
-pub(crate) const ELSEWHERE_DEG: f64 = 10.0;
+const ELSEWHERE_DEG: f64 = 10.0;
 
 /// The motion `(ω, υ)` about the object that takes one pose to another, in the axes of the first one's camera: the camera turned about the
 /// object's centre by `ω` (radians), then shifted by `υ` (object units).

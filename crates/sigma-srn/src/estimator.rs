@@ -7,7 +7,7 @@ use glam::DMat4;
 use serde::Serialize;
 
 use crate::camera::{Intrinsics, Pose6};
-use crate::confidence::{ELSEWHERE_DEG, motion};
+use crate::confidence::motion;
 use crate::descent::{Descent, Loss, Method, Shape};
 use crate::engine::{Engine, proof};
 use crate::light::Light;
@@ -27,6 +27,10 @@ const MET: f64 = 1e-3;
 /// By how much higher a loss than the best one the rival may have to go on with it. A search that has not ended exaggerates: of the steering part's
 /// `000018` the right pose stands at 1.6 times the loss of the one turned by 180° where three go on, and ends at 0.7 times.
 const RIVAL: f64 = 2.0;
+
+/// How far a rival is turned from the best, in degrees, where rays are cast at every pixel. At every other pixel it is twice as far: descents there are from
+/// starts 30° and more apart, have just begun, and may lead to one side yet.
+const RIVAL_DEG: f64 = 15.0;
 
 /// What steps at every pixel are multiples of, in radians and object units: a sixtieth of a pixel of 64 at most, and a number that sums of it are exact of.
 const GRAIN: f32 = 1.0 / 4096.0;
@@ -433,10 +437,10 @@ fn split_off_met(own: &mut Vec<Hypothesis>) -> Vec<Hypothesis> {
 }
 
 /// Takes the best that shows another side than the first of a query's hypotheses, the best first, out of those, if it would not be among the
-/// `keep` that enter a phase. The wider the rays are apart, the fewer steps have been taken: what will be one side is still further apart.
+/// `keep` that enter a phase.
 fn take_rival(own: &mut Vec<Hypothesis>, keep: usize, stride: u32) -> Option<Hypothesis> {
     let best = *own.first()?;
-    let rival = own.iter().position(|other| best.pose.degrees_from(other.pose) > ELSEWHERE_DEG * f64::from(stride))?;
+    let rival = own.iter().position(|other| best.pose.degrees_from(other.pose) > RIVAL_DEG * f64::from(stride))?;
     (rival >= keep && own[rival].loss <= RIVAL * best.loss).then(|| own.remove(rival))
 }
 
@@ -733,7 +737,7 @@ mod tests {
             let pose = Pose6::from_matrix(&(DMat4::from_axis_angle(glam::DVec3::Y, f64::to_radians(degrees)) * truth));
             Hypothesis { query: 0, start, pose, loss, curvature: None, phases: 1, dilation: 0.0 }
         };
-        let own = [(0.0, 1.0), (3.0, 1.1), (9.0, 1.2), (15.0, 1.5), (180.0, 1.9), (170.0, 2.1)];
+        let own = [(0.0, 1.0), (3.0, 1.1), (14.0, 1.2), (20.0, 1.5), (180.0, 1.9), (170.0, 2.1)];
         let own: Vec<Hypothesis> = own.into_iter().enumerate().map(new).collect();
         let taken = |own: &[Hypothesis], keep: usize, stride: u32| {
             let mut own = own.to_vec();
@@ -741,7 +745,7 @@ mod tests {
             assert!(own.iter().all(|left| Some(left.start) != rival) && own.is_sorted_by_key(|left| left.start));
             rival
         };
-        // 15° are another side with rays at every pixel, but not at every other one.
+        // 20° are another side with rays at every pixel, but not at every other one.
         assert_eq!([1, 3, 4].map(|keep| taken(&own, keep, 1)), [Some(3), Some(3), None]);
         assert_eq!([1, 3, 4, 5, usize::MAX].map(|keep| taken(&own, keep, 2)), [Some(4), Some(4), Some(4), None, None]);
         // The loss of the last is more than twice that of the best.
