@@ -24,7 +24,7 @@ const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
 /// of 64. What is left of the search takes both to the same minimum.
 const MET: f64 = 1e-3;
 
-/// By how much higher a loss than the best one the rival may have to go on with it. A search that has not ended exaggerates: of the steering part's
+/// How many times the loss of the best hypothesis a rival may have to go on beside it. A search that has not ended exaggerates: of the steering part's
 /// `000018` the right pose stands at 1.6 times the loss of the one turned by 180° where three go on, and ends at 0.7 times.
 const RIVAL: f64 = 2.0;
 
@@ -73,7 +73,7 @@ pub struct Phase {
     /// beginning of the phase shows: where both are white nothing is to be seen.
     pub stride: u32,
     /// How many hypotheses of each image enter this phase: those with the lowest loss, and of several that have come to the same pose the best
-    /// alone. Where all of them look at the same side of the object, one more: the best of another side, unless its loss is more than twice theirs.
+    /// alone. Where all of them look at the same side of the object, one more: the best of another side, unless its loss is more than twice that of the best.
     /// `usize::MAX`: all.
     pub keep: usize,
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`] is known: see [`Light`]. From wrong
