@@ -356,6 +356,12 @@ fn cholesky(m: &Matrix6) -> Option<Matrix6> {
     Some(lower)
 }
 
+/// By how much second derivatives and a gradient promise a lower loss, `½ gᵀ B⁻¹ g`: nothing where they are not those near a minimum.
+pub(crate) fn promise(curvature: &Matrix6, gradient: &[f64; 6]) -> f64 {
+    let squares = |lower: Matrix6| forward(&lower, *gradient).iter().map(|x| x * x).sum::<f64>();
+    cholesky(curvature).map_or(0.0, |lower| 0.5 * squares(lower))
+}
+
 /// `L⁻¹ x`.
 fn forward(lower: &Matrix6, mut x: [f64; 6]) -> [f64; 6] {
     for i in 0..6 {
@@ -394,6 +400,17 @@ mod tests {
             extent: 0.5,
             ranking,
         }
+    }
+
+    #[test]
+    fn second_derivatives_promise_what_the_way_to_the_minimum_brings() {
+        let way = [0.1, -0.2, 0.0, 0.3, 0.05, -0.4];
+        let product = |by: &[f64; 6]| curvature().map(|row| row.iter().zip(by).map(|(b, x)| b * x).sum::<f64>());
+        let gradient = product(&way);
+        let brings = 0.5 * gradient.iter().zip(&way).map(|(g, x)| g * x).sum::<f64>();
+        assert!((promise(&curvature(), &gradient) / brings - 1.0).abs() < 1e-12);
+        let saddle: Matrix6 = std::array::from_fn(|i| std::array::from_fn(|j| if i != j { 0.0 } else { 2.0 - i as f64 }));
+        assert_eq!([promise(&saddle, &gradient), promise(&[[f64::NAN; 6]; 6], &gradient)], [0.0; 2]);
     }
 
     #[test]

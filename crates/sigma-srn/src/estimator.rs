@@ -7,7 +7,7 @@ use glam::DMat4;
 use serde::Serialize;
 
 use crate::camera::{Intrinsics, Pose6};
-use crate::confidence::motion;
+use crate::confidence::{motion, promise};
 use crate::descent::{Descent, Loss, Method, Shape};
 use crate::engine::{Engine, proof};
 use crate::light::Light;
@@ -34,6 +34,9 @@ const RIVAL_DEG: f64 = 15.0;
 
 /// What steps at every pixel are multiples of, in radians and object units: a sixtieth of a pixel of 64 at most, and a number that sums of it are exact of.
 const GRAIN: f32 = 1.0 / 4096.0;
+
+/// By which part second derivatives may promise a lower loss where a search has arrived.
+const ARRIVED: f64 = 0.01;
 
 /// Hypotheses that a GPU, and cooperative matrices, are tried on.
 const TRIED: usize = 8;
@@ -95,6 +98,9 @@ pub struct Options {
     pub min_starts: usize,
     /// Phases, one after the other.
     pub phases: Vec<Phase>,
+    /// How many times the last phase begins anew, at most, for images whose poses have not arrived: where the second derivatives there promise a loss that
+    /// is lower than the best by more than a hundredth. With BFGS only.
+    pub anew: u32,
     /// Seed of the initial depths of Adam's rays. With BFGS all begin at the mean depth: random ones change the losses of hypotheses by half a
     /// thousandth, as much as those of minima side by side differ.
     pub seed: u64,
@@ -122,7 +128,7 @@ impl Options {
     /// BFGS: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the best few on
     /// all, until they stand still: the loss has minima side by side. Then once more with new second derivatives: where a valley is flat and
     /// full of kinks, those that steps have learnt leave a pose a tenth of a degree before its end. These two make up for the light, and before them masks
-    /// are tried dilated.
+    /// are tried dilated. And on so for those that have not arrived: most have, in a number of steps that would be too small for some.
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents) = match effort {
             Effort::Fast => (84, [(6, 6), (6, 2), (5, 1), (5, 1), (3, 1)]),
@@ -133,7 +139,7 @@ impl Options {
         let phase = |((stride, light, dilate), (steps, keep))| Phase { steps, stride, keep, light, dilate };
         let kinds = [(4, false, false), (2, false, false), (2, true, true), (1, true, false), (1, true, false)];
         phases.extend(zip(kinds, descents).map(phase));
-        Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, phases, seed: 0 }
+        Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, phases, anew: 6, seed: 0 }
     }
 
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
@@ -143,13 +149,15 @@ impl Options {
             method,
             min_starts: 0,
             phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, dilate: false }],
+            anew: 0,
             seed: 0,
         }
     }
 
-    /// The same with `steps` steps in all, shared between the phases in their present proportions; those that try dilations have as many more or fewer,
+    /// The same with `steps` steps in all, none anew, shared between the phases in their present proportions; those that try dilations have as many more or fewer,
     /// and come on top. Where there are any at all, a phase whose share is none is left out.
     pub fn with_steps(mut self, steps: u32) -> Self {
+        self.anew = 0;
         let total = self.phases.iter().filter(|phase| !phase.dilate).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
         let share = |of: u64| (2 * of * u64::from(steps) + total) / (2 * total);
         let (mut before, mut done) = (0, 0);
@@ -232,7 +240,7 @@ pub struct Estimate {
 pub struct Progress<'a> {
     /// Steps done, over all phases.
     pub step: u32,
-    /// Steps in all.
+    /// Steps in all, as far as is known: more where poses have not arrived, see [`Options::anew`].
     pub steps: u32,
     /// Searches that have gone before, where several follow one another: see [`Search`](crate::Search).
     pub search: usize,
@@ -250,6 +258,8 @@ struct Hypothesis {
     pose: Pose6,
     loss: f64,
     curvature: Option<[[f64; 6]; 6]>,
+    /// By how much that promises a lower loss.
+    promise: f64,
     phases: usize,
     /// Of the image's mask, in the running phase.
     dilation: f64,
@@ -264,7 +274,7 @@ pub fn estimate(
     model: &Model,
     queries: &[Query],
     options: &Options,
-    mut observe: impl FnMut(Progress) -> Result<(), Error>,
+    observe: impl FnMut(Progress) -> Result<(), Error>,
 ) -> Result<Vec<Estimate>, Error> {
     check(model, queries, options)?;
     let (model, queries) = at_work(model, queries)?;
@@ -276,14 +286,12 @@ pub fn estimate(
         options.phases.iter().filter(runs).map(|phase| phase.steps).sum(),
         options.phases.iter().rposition(|phase| runs(&phase)),
     );
-    let mut step = 0;
     let mut hypotheses: Vec<Hypothesis> = Vec::new();
-    let mut lights = vec![None; queries.len()];
     let mut dilations: Vec<Option<f64>> = queries.iter().map(|query| (query.dilation != 0.0).then_some(query.dilation)).collect();
     for (query, q) in queries.iter().enumerate() {
         let new = |(start, matrix)| {
             let pose = Pose6::from_matrix(matrix);
-            Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, phases: 0, dilation: q.dilation }
+            Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, promise: 0.0, phases: 0, dilation: q.dilation }
         };
         let around = (q.starts.len() < options.min_starts).then(|| q.starts.iter().flat_map(turned));
         let starts: Vec<DMat4> = q.starts.iter().copied().chain(around.into_iter().flatten()).collect();
@@ -309,6 +317,7 @@ pub fn estimate(
     engine
         .check_cooperative(|engine| gradients_of(engine, &hypotheses[..hypotheses.len().min(TRIED)], options.phases[0].stride))?;
 
+    let mut search = Course { engine, model, queries, options, lights: vec![None; queries.len()], step: 0, steps, observe };
     for (number, phase) in options.phases.iter().enumerate() {
         let mut running: Vec<Hypothesis> = Vec::new();
         // Dropped, or waiting.
@@ -336,46 +345,8 @@ pub fn estimate(
             hypotheses = rest;
             continue;
         }
-        let names: Vec<(usize, usize)> = running.iter().map(|h| (h.query, h.start)).collect();
-        let mut descent;
-        let is_moving = phase.steps > 0 || Some(number) == last;
-        (descent, lights) = prepare(engine, model, queries, options, phase, is_moving, &running)?;
-        let rows = running.len() * rays_of(&queries[0], phase.stride).count();
-        for _ in 0..phase.steps {
-            // New depths in every step, as in the paper.
-            if matches!(options.method, Method::Adam { .. }) {
-                let mut random = stream(options.seed, 1 + u64::from(step));
-                descent.set_initial_depths(&initial_depths(&mut random, rows))?;
-            }
-            descent.evaluate()?;
-            observe(Progress { step, steps, search: 0, hypotheses: &names, descent: &mut descent })?;
-            descent.descend()?;
-            step += 1;
-        }
-        if phase.steps == 0 {
-            descent.compare()?;
-        } else {
-            descent.evaluate()?;
-        }
-        observe(Progress { step, steps, search: 0, hypotheses: &names, descent: &mut descent })?;
-        let standing = descent.standing()?;
-        if Some(number) == last && matches!(options.method, Method::Bfgs { .. }) {
-            // What BFGS has learnt of them by now depends on how many steps it took, and on their way.
-            let poses: Vec<Pose6> = standing.iter().map(|(_, pose)| *pose).collect();
-            descent.set_poses(&poses)?;
-            descent.evaluate()?;
-            for (hypothesis, curvature) in running.iter_mut().zip(descent.curvatures()?) {
-                hypothesis.curvature = Some(curvature);
-            }
-        }
-        for (hypothesis, standing) in running.iter_mut().zip(standing) {
-            (hypothesis.loss, hypothesis.pose) = standing;
-            // A NaN must not win; something near the largest f32 is what a descent holds that never had another.
-            if hypothesis.loss.is_nan() || hypothesis.loss > 1e38 {
-                hypothesis.loss = f64::INFINITY;
-            }
-            hypothesis.phases = number + 1;
-        }
+        search.follow(phase, Some(number) == last, &mut running)?;
+        running.iter_mut().for_each(|h| h.phases = number + 1);
         if phase.dilate {
             // Those of one start come one after the other.
             let least = |tried: &&[Hypothesis]| tried.iter().map(|h| h.loss).fold(f64::INFINITY, f64::min);
@@ -394,6 +365,14 @@ pub fn estimate(
         hypotheses.extend(rest);
         hypotheses.iter_mut().for_each(|h| h.dilation = dilations[h.query].unwrap_or(0.0));
     }
+    for _ in 0..options.anew {
+        let (mut running, rest) = split_off_late(&hypotheses, queries.len(), options.phases.len());
+        let Some(phase) = last.filter(|_| !running.is_empty()).map(|last| &options.phases[last]) else { break };
+        search.steps += phase.steps;
+        search.follow(phase, true, &mut running)?;
+        hypotheses = running;
+        hypotheses.extend(rest);
+    }
 
     let mut estimates = Vec::new();
     for (query, q) in queries.iter().enumerate() {
@@ -401,7 +380,7 @@ pub fn estimate(
         own.sort_by(|a, b| b.phases.cmp(&a.phases).then(a.loss.total_cmp(&b.loss)));
         let ranked = |h: &&Hypothesis| Ranked { start: h.start, loss: h.loss, phases: h.phases, pose: h.pose };
         let &Hypothesis { pose, loss, curvature, .. } = own[0];
-        let (light, dilation) = (lights[query], dilations[query]);
+        let (light, dilation) = (search.lights[query], dilations[query]);
         let (rgb, coverage) = seen(q, dilation.unwrap_or(0.0));
         let mut target = rgb.into_owned();
         if let Some(light) = light {
@@ -423,6 +402,86 @@ pub(crate) fn at_work<'a>(model: &'a Model, queries: &'a [Query]) -> Result<(Cow
     }
     let numbered = zip(queries, numbers).map(|(query, instance)| Query { instance, ..query.clone() });
     Ok((at_work, numbered.collect()))
+}
+
+/// A search on its way through the phases.
+struct Course<'a, F> {
+    engine: &'a Engine,
+    model: &'a Model,
+    queries: &'a [Query],
+    options: &'a Options,
+    /// Of each query, as the last phase made up for it.
+    lights: Vec<Option<Light>>,
+    step: u32,
+    steps: u32,
+    observe: F,
+}
+
+impl<F: FnMut(Progress) -> Result<(), Error>> Course<'_, F> {
+    /// Takes hypotheses through a phase, those of a query one after the other, the best first. What second derivatives say at its end is found out where
+    /// the search may end there.
+    fn follow(&mut self, phase: &Phase, may_end: bool, running: &mut [Hypothesis]) -> Result<(), Error> {
+        let Course { engine, model, queries, options, .. } = *self;
+        let names: Vec<(usize, usize)> = running.iter().map(|h| (h.query, h.start)).collect();
+        let is_moving = phase.steps > 0 || may_end;
+        let (mut descent, lights) = prepare(engine, model, queries, options, phase, is_moving, running)?;
+        running.iter().for_each(|h| self.lights[h.query] = lights[h.query]);
+        let rows = running.len() * rays_of(&queries[0], phase.stride).count();
+        for _ in 0..phase.steps {
+            // New depths in every step, as in the paper.
+            if matches!(options.method, Method::Adam { .. }) {
+                let mut random = stream(options.seed, 1 + u64::from(self.step));
+                descent.set_initial_depths(&initial_depths(&mut random, rows))?;
+            }
+            descent.evaluate()?;
+            self.observe(&names, &mut descent)?;
+            descent.descend()?;
+            self.step += 1;
+        }
+        if phase.steps == 0 {
+            descent.compare()?;
+        } else {
+            descent.evaluate()?;
+        }
+        self.observe(&names, &mut descent)?;
+        let standing = descent.standing()?;
+        if may_end && matches!(options.method, Method::Bfgs { .. }) {
+            // What BFGS has learnt of them by now depends on how many steps it took, and on their way.
+            let poses: Vec<Pose6> = standing.iter().map(|(_, pose)| *pose).collect();
+            descent.set_poses(&poses)?;
+            descent.evaluate()?;
+            for (h, (curvature, gradient)) in zip(&mut *running, zip(descent.curvatures()?, descent.gradients()?)) {
+                (h.curvature, h.promise) = (Some(curvature), promise(&curvature, &gradient));
+            }
+        }
+        for (hypothesis, standing) in zip(running, standing) {
+            (hypothesis.loss, hypothesis.pose) = standing;
+            // A NaN must not win; something near the largest f32 is what a descent holds that never had another.
+            if hypothesis.loss.is_nan() || hypothesis.loss > 1e38 {
+                hypothesis.loss = f64::INFINITY;
+            }
+        }
+        Ok(())
+    }
+
+    fn observe(&mut self, hypotheses: &[(usize, usize)], descent: &mut Descent) -> Result<(), Error> {
+        (self.observe)(Progress { step: self.step, steps: self.steps, search: 0, hypotheses, descent })
+    }
+}
+
+/// Those that went through all phases, of queries that have not arrived, see [`Options::anew`]; and all others.
+fn split_off_late(hypotheses: &[Hypothesis], queries: usize, phases: usize) -> (Vec<Hypothesis>, Vec<Hypothesis>) {
+    let (mut late, mut rest) = (Vec::new(), Vec::new());
+    for query in 0..queries {
+        let of_query = hypotheses.iter().copied().filter(|h| h.query == query);
+        let (mut own, others): (Vec<_>, Vec<_>) = of_query.partition(|h| h.phases == phases);
+        own.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+        let promised = own.iter().map(|h| h.loss - h.promise).fold(f64::INFINITY, f64::min);
+        let is_late = own.first().is_some_and(|best| promised < (1.0 - ARRIVED) * best.loss);
+        if is_late { &mut late } else { &mut rest }.extend(own);
+        rest.extend(others);
+    }
+    (late, rest)
 }
 
 /// Takes those out of a query's hypotheses, the best first, that have come to where a better one stands.
@@ -721,7 +780,7 @@ mod tests {
         let poses = [truth, turned(9e-4), turned(1.5e-3), shifted(9e-4), shifted(2e-3), turned(1.6e-3), turned(3.0)];
         let new = |(start, pose)| {
             let pose = Pose6::from_matrix(pose);
-            Hypothesis { query: 0, start, pose, loss: start as f64, curvature: None, phases: 1, dilation: 0.0 }
+            Hypothesis { query: 0, start, pose, loss: start as f64, curvature: None, promise: 0.0, phases: 1, dilation: 0.0 }
         };
         let mut own: Vec<Hypothesis> = poses.iter().enumerate().map(new).collect();
         own.push(Hypothesis { pose: Pose6([f64::NAN; 6]), start: 7, loss: f64::INFINITY, ..own[0] });
@@ -735,7 +794,7 @@ mod tests {
         let truth = crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
         let new = |(start, (degrees, loss)): (usize, (f64, f64))| {
             let pose = Pose6::from_matrix(&(DMat4::from_axis_angle(glam::DVec3::Y, f64::to_radians(degrees)) * truth));
-            Hypothesis { query: 0, start, pose, loss, curvature: None, phases: 1, dilation: 0.0 }
+            Hypothesis { query: 0, start, pose, loss, curvature: None, promise: 0.0, phases: 1, dilation: 0.0 }
         };
         let own = [(0.0, 1.0), (3.0, 1.1), (14.0, 1.2), (20.0, 1.5), (180.0, 1.9), (170.0, 2.1)];
         let own: Vec<Hypothesis> = own.into_iter().enumerate().map(new).collect();
@@ -754,6 +813,39 @@ mod tests {
     }
 
     #[test]
+    fn an_image_goes_on_while_a_lower_loss_than_the_best_is_promised() {
+        let pose = Pose6::from_matrix(&crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6)));
+        let new = |(query, start, loss, promise, phases)| Hypothesis {
+            query,
+            start,
+            pose,
+            loss,
+            curvature: None,
+            promise,
+            phases,
+            dilation: 0.0,
+        };
+        // Of the images one has arrived; another's best, or what is beside its best, promises more; what another's dropped one promises counts no more.
+        let all = [
+            (0, 0, 1.0, 0.009, 2),
+            (0, 1, 1.5, 0.5, 2),
+            (1, 0, 1.5, 0.0, 2),
+            (1, 1, 1.0, 0.02, 2),
+            (1, 2, 0.5, 0.4, 1),
+            (2, 0, 1.0, 0.0, 2),
+            (2, 1, 1.5, 0.6, 2),
+            (3, 0, 1.0, 0.0, 2),
+            (3, 1, 1.0, 0.5, 1),
+            (4, 0, f64::INFINITY, f64::NAN, 2),
+        ];
+        let all: Vec<Hypothesis> = all.into_iter().map(new).collect();
+        let (late, rest) = split_off_late(&all, 5, 2);
+        let names = |of: &[Hypothesis]| of.iter().map(|h| (h.query, h.start)).collect::<Vec<_>>();
+        assert_eq!(names(&late), [(1, 1), (1, 0), (2, 0), (2, 1)]);
+        assert_eq!(names(&rest), [(0, 0), (0, 1), (1, 2), (3, 0), (3, 1), (4, 0)]);
+    }
+
+    #[test]
     fn steps_keep_their_proportions() {
         let default = Options::default();
         // Pictures without a mask have no others.
@@ -762,7 +854,7 @@ mod tests {
             assert_eq!(all(&default.clone().with_steps(steps)), steps);
         }
         let total = all(&default);
-        assert_eq!(default.clone().with_steps(total), default);
+        assert_eq!(default.clone().with_steps(total), Options { anew: 0, ..default.clone() });
         // A look at all starts, dilations, and the phase that has the step.
         let one: Vec<(u32, u32)> = default.clone().with_steps(1).phases.iter().map(|phase| (phase.steps, phase.stride)).collect();
         assert_eq!(one, [(0, 4), (0, 2), (1, 1)]);
