@@ -566,7 +566,7 @@ fn what_does_not_count_has_no_influence() {
     let methods = [Loss::Mae, Loss::NormL2].map(adam).into_iter().chain([Method::Bfgs { soft: 0.3, grain: 0.0 }]);
     for method in methods {
         let phases = [(2, 4), (1, 2)].map(|(stride, keep)| Phase { steps: 3, stride, keep, light: false, dilate: false }).into();
-        let options = Options { method, min_starts: 0, phases, anew: 0, seed: 0 };
+        let options = Options { method, min_starts: 0, align: false, phases, anew: 0, seed: 0 };
         for engine in engines() {
             let found = |rgb: &[f32], weights| {
                 let queries = [query(rgb, weights), query(&free, None)];

@@ -6,6 +6,7 @@ use std::iter::zip;
 use glam::DMat4;
 use serde::Serialize;
 
+use crate::align::Shown;
 use crate::camera::{Intrinsics, Pose6};
 use crate::confidence::{motion, promise};
 use crate::descent::{Descent, Loss, Method, Shape};
@@ -96,6 +97,9 @@ pub struct Options {
     /// Where an image has fewer starts than this, six more are tried around each, turned by 40° about the object: to either side about each
     /// axis of the camera.
     pub min_starts: usize,
+    /// Whether starts are moved first, where [`Query::coverage`] is known: nearer or farther away, and turned about themselves, until the object is as large and
+    /// at the same place in the views from there, as the first phase would show them, as in the image. Else their distance and aim are taken for known.
+    pub align: bool,
     /// Phases, one after the other.
     pub phases: Vec<Phase>,
     /// How many times the last phase begins anew, at most, for images whose poses have not arrived: where the second derivatives there promise a loss that
@@ -139,7 +143,7 @@ impl Options {
         let phase = |((stride, light, dilate), (steps, keep))| Phase { steps, stride, keep, light, dilate };
         let kinds = [(4, false, false), (2, false, false), (2, true, true), (1, true, false), (1, true, false)];
         phases.extend(zip(kinds, descents).map(phase));
-        Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, phases, anew: 6, seed: 0 }
+        Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, align: true, phases, anew: 6, seed: 0 }
     }
 
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
@@ -148,6 +152,7 @@ impl Options {
         Options {
             method,
             min_starts: 0,
+            align: false,
             phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, dilate: false }],
             anew: 0,
             seed: 0,
@@ -317,6 +322,9 @@ pub fn estimate(
     engine
         .check_cooperative(|engine| gradients_of(engine, &hypotheses[..hypotheses.len().min(TRIED)], options.phases[0].stride))?;
 
+    if options.align {
+        align(engine, model, queries, options, &mut hypotheses)?;
+    }
     let mut search = Course { engine, model, queries, options, lights: vec![None; queries.len()], step: 0, steps, observe };
     for (number, phase) in options.phases.iter().enumerate() {
         let mut running: Vec<Hypothesis> = Vec::new();
@@ -467,6 +475,36 @@ impl<F: FnMut(Progress) -> Result<(), Error>> Course<'_, F> {
     fn observe(&mut self, hypotheses: &[(usize, usize)], descent: &mut Descent) -> Result<(), Error> {
         (self.observe)(Progress { step: self.step, steps: self.steps, search: 0, hypotheses, descent })
     }
+}
+
+/// Moves the starts of images whose coverage is known, see [`Options::align`].
+fn align(
+    engine: &Engine,
+    model: &Model,
+    queries: &[Query],
+    options: &Options,
+    hypotheses: &mut [Hypothesis],
+) -> Result<(), Error> {
+    let mut starts: Vec<&mut Hypothesis> = hypotheses.iter_mut().filter(|h| queries[h.query].coverage.is_some()).collect();
+    let running: Vec<Hypothesis> = starts.iter().map(|h| **h).collect();
+    if running.is_empty() {
+        return Ok(());
+    }
+    let (phase, method) = (&options.phases[0], options.method);
+    let targets = Targets::new(queries, options, phase, &running);
+    let mut views = targets.descent(engine, model, method, false, &running)?;
+    views.compare()?;
+    let renders = views.rgb()?;
+    let values = 3 * targets.rays_per_image();
+    for (start, (rgb, render)) in zip(&mut starts, zip(targets.rgb.chunks(values), renders.chunks(values))) {
+        let query = &queries[start.query];
+        let weights = weights_of(query, phase.stride);
+        let shown = |rgb: &[f32]| Shown::of(rgb, &weights, rays_of(query, phase.stride));
+        if let (Some(wanted), Some(now)) = (shown(rgb), shown(render)) {
+            start.pose = Pose6::from_matrix(&wanted.seen_by(&now, &start.pose.to_matrix(), &query.intrinsics));
+        }
+    }
+    Ok(())
 }
 
 /// Those that went through all phases, of queries that have not arrived, see [`Options::anew`]; and all others.

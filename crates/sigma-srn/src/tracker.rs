@@ -102,7 +102,7 @@ impl Tracker {
             (_, None) => vec![phase(5, 2, 1), Phase { dilate: true, ..phase(5, 2, 1) }, phase(3, 1, 1)],
         };
         let (first, _) = self.search.tries()?;
-        let options = Options { phases, min_starts: 0, ..first.clone() };
+        let options = Options { phases, min_starts: 0, align: false, ..first.clone() };
         Ok(Search { tries: vec![options], accept: self.search.accept })
     }
 }
