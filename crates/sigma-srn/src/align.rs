@@ -87,7 +87,8 @@ mod tests {
             let [wanted, now] = [&truth, &guess].map(|pose| shown(&picture(pose, &intrinsics)).unwrap());
             let moved = wanted.seen_by(&now, &guess, &intrinsics);
             let (degrees, far) = crate::camera::pose_error(&moved, &truth);
-            assert!(degrees < 0.5 && far < 0.02 * times, "{times} {x} {y}: {degrees}° {far}");
+            // From nearer, perspective makes its near side larger, too: 4 % of the distance.
+            assert!(degrees < 0.5 && far < 0.05 * truth.w_axis.truncate().length(), "{times} {x} {y}: {degrees}° {far}");
         }
     }
 
