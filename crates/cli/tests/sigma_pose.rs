@@ -388,6 +388,8 @@ fn bad_calls_end_with_2_and_one_line() {
         (format!("{image} {model} --mask ."), &["000003.png", "the mask of"]),
         (format!("{image} {model} --mask nan.txt"), &["nan.txt", "not a readable image"]),
         (format!("{image} {model} --mask a.png --mask b.png"), &["--mask", "2 masks for 1"]),
+        (format!("{image} {model} --cutout nowhere.png"), &["nowhere.png"]),
+        (format!("{image} {model} --cutout a.png --cutout b.png"), &["--cutout", "2 masks for 1"]),
         (format!("{image} {model} --truth nan.txt --truth nan.txt"), &["--truth", "2 poses for 1"]),
         (format!("{image} {model} --loss l3"), &["l3", "gmsd"]),
         (format!("{image} {model} --loss mse"), &["--loss", "--preset paper"]),
@@ -597,6 +599,15 @@ fn a_mask_takes_pixels_out_of_the_search() {
     cut.save(dir.join("cut.png")).unwrap();
     assert!(found("cut.png", "")["mask_dilation_px"].is_f64() && plain["mask_dilation_px"].is_null(), "{plain}");
     assert_eq!(plain, found("0156.png", "--mask masks/0156.png"));
+    // A mask that cuts it out is as good as transparency, whatever is behind.
+    let same = |mut image: Value| {
+        image.as_object_mut().unwrap().remove("name");
+        image
+    };
+    let [transparent, cut_out, other] =
+        [("cut.png", ""), ("0156.png", "--cutout masks"), ("other/0156.png", "--cutout masks/0156.png")]
+            .map(|(image, mask)| same(found(image, mask)));
+    assert_eq!([&cut_out, &other], [&transparent; 2]);
     // The box lies beside the middle: the starts look at where it is.
     let outline = image::open(dir.join("pictures/seat-0156-outline.png")).unwrap().into_rgb8();
     let factor = outline.width() / size.0;
@@ -607,6 +618,8 @@ fn a_mask_takes_pixels_out_of_the_search() {
     fail_with("--fov 53.5 --instance seat --mask black.png", &["black.png", "nothing"]);
     image::GrayImage::new(8, 8).save(dir.join("small.png")).unwrap();
     fail_with("--fov 53.5 --instance seat --mask small.png", &["small.png", "8×8"]);
+    fail_with("--fov 53.5 --instance seat --cutout black.png", &["black.png", "nothing"]);
+    fail_with("--fov 53.5 --instance seat --cutout small.png", &["small.png", "8×8"]);
 }
 
 /// Pictures cut out with a rim of the table around the object, or with too little of it.

@@ -46,12 +46,24 @@ impl Target {
         Ok(Self { rgb, weights: Some(weights), coverage: None, intrinsics, cut: false, corner, extent })
     }
 
-    /// Reads a photograph and cuts a square around what mask and transparency leave of it, with [`MARGIN`]; the intrinsics follow.
-    /// Pixels where the mask is black, or outside of the photograph, do not count; transparent ones are white background, and do.
-    /// Without mask and transparency it is the centre square.
-    pub fn of_photo(path: &Path, mask: Option<&Path>, intrinsics: &Intrinsics, side: usize) -> Result<Self> {
-        let (picture, opacity) = Pixels::open_with_opacity(path)?;
+    /// Reads a photograph and cuts a square around what masks and transparency leave of it, with [`MARGIN`]; the intrinsics follow.
+    /// Pixels where the mask is black, or outside of the photograph, do not count; where the cutout is black they are white background, as transparent
+    /// ones are, and do. Without any of these it is the centre square.
+    pub fn of_photo(
+        path: &Path,
+        cutout: Option<&Path>,
+        mask: Option<&Path>,
+        intrinsics: &Intrinsics,
+        side: usize,
+    ) -> Result<Self> {
+        let (mut picture, mut opacity) = Pixels::open_with_opacity(path)?;
         let size = [picture.width, picture.height];
+        if let Some(cutout) = cutout {
+            for ((colours, opacity), object) in picture.data.chunks_exact_mut(3).zip(&mut opacity).zip(counts(cutout, size)?) {
+                colours.iter_mut().for_each(|colour| *colour = object * *colour + (1.0 - object));
+                *opacity *= object;
+            }
+        }
         let counts = mask.map(|mask| counts(mask, size)).transpose()?;
         let inside = |i: usize| opacity[i] > 0.5 && counts.as_ref().is_none_or(|counts| counts[i] > 0.5);
         let points = (0..opacity.len()).filter(|&i| inside(i)).map(|i| [i % size[0], i / size[0]]);
@@ -60,7 +72,12 @@ impl Target {
             Some([[0, 1].map(|k| low[k].min(p[k])), [0, 1].map(|k| high[k].max(p[k]))])
         });
         let Some([low, high]) = bounds else {
-            return Err(Error::field(mask.unwrap_or(path), "mask", "white, or opaque, where the object is", "nothing of it"));
+            return Err(Error::field(
+                mask.or(cutout).unwrap_or(path),
+                "mask",
+                "white, or opaque, where the object is",
+                "nothing of it",
+            ));
         };
         if points.count() == opacity.len() {
             return Self::of_view(path, None, intrinsics, side);
@@ -136,7 +153,7 @@ mod tests {
         let object = |x: u32, y: u32| (41..51).contains(&x) && (6..12).contains(&y);
         let mask = GrayImage::from_fn(60, 40, |x, y| Luma([if object(x, y) { 255 } else { 0 }]));
         let mask = saved(dir.path(), "mask.png", mask);
-        let target = Target::of_photo(&photo, Some(&mask), &INTRINSICS, 6).unwrap();
+        let target = Target::of_photo(&photo, None, Some(&mask), &INTRINSICS, 6).unwrap();
         // 10 pixels and a tenth on each side: 12, two for each of the square's; rows 3 to 14.
         assert_eq!((target.corner, target.extent), ([40, 3], 12));
         let weights = target.weights.unwrap();
@@ -160,14 +177,17 @@ mod tests {
             Rgba([r, g, b, if object(x, y) { 255 } else { 0 }])
         });
         let cut = saved(dir.path(), "cut.png", cut);
-        let alone = Target::of_photo(&cut, None, &INTRINSICS, 6).unwrap();
+        let alone = Target::of_photo(&cut, None, None, &INTRINSICS, 6).unwrap();
         assert_eq!((alone.corner, alone.extent, alone.weights.is_none()), ([40, 3], 12, true));
         assert_eq!((&alone.rgb[..3], &alone.rgb[3 * 13..][..3]), (&[1.0; 3][..], &[-1.0, -1.0, 1.0][..]));
-        let coverage = alone.coverage.unwrap();
+        let coverage = alone.coverage.as_ref().unwrap();
         assert_eq!((&coverage[..6], &coverage[12..18]), (&[0.0; 6][..], &[0.5, 1.0, 1.0, 1.0, 1.0, 0.5][..]));
+        // A mask that cuts out is as good, and goes together with transparency.
+        assert_eq!(Target::of_photo(&photo, Some(&mask), None, &INTRINSICS, 6).unwrap(), alone);
+        assert_eq!(Target::of_photo(&cut, Some(&mask), None, &INTRINSICS, 6).unwrap(), alone);
         let left = GrayImage::from_fn(60, 40, |x, _| Luma([if x < 46 { 255 } else { 0 }]));
         let left = saved(dir.path(), "left.png", left);
-        let both = Target::of_photo(&cut, Some(&left), &INTRINSICS, 6).unwrap();
+        let both = Target::of_photo(&cut, None, Some(&left), &INTRINSICS, 6).unwrap();
         assert_eq!((both.corner, both.extent), ([39, 5], 8));
         // 7 of its 8 columns are in the mask; the last of the square's takes in the last one and a third.
         assert_eq!(both.weights.unwrap()[..6], [1.0, 1.0, 1.0, 1.0, 1.0, 0.25]);
@@ -178,7 +198,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let photo = saved(dir.path(), "photo.png", RgbImage::from_pixel(60, 40, Rgb([255, 0, 0])));
         let mask = saved(dir.path(), "mask.png", GrayImage::from_fn(60, 40, |x, _| Luma([if x < 20 { 255 } else { 0 }])));
-        let target = Target::of_photo(&photo, Some(&mask), &INTRINSICS, 12).unwrap();
+        let target = Target::of_photo(&photo, None, Some(&mask), &INTRINSICS, 12).unwrap();
         assert_eq!((target.corner, target.extent), ([-14, -4], 48));
         let weights = target.weights.unwrap();
         // Of the square's row, 14 pixels lie outside, 20 in the mask: 3.5 and 5 of its own.
@@ -195,7 +215,7 @@ mod tests {
         let plain = Target::of_view(&path, None, &INTRINSICS, 8).unwrap();
         assert_eq!((&plain.rgb, plain.intrinsics, plain.weights, plain.coverage), (&pixels.data, intrinsics, None, None));
         assert_eq!((plain.corner, plain.extent), ([10, 0], 40));
-        assert_eq!(Target::of_photo(&path, None, &INTRINSICS, 8).unwrap().rgb, pixels.data);
+        assert_eq!(Target::of_photo(&path, None, None, &INTRINSICS, 8).unwrap().rgb, pixels.data);
         let top = saved(dir.path(), "top.png", GrayImage::from_fn(60, 40, |_, y| Luma([if y < 20 { 255 } else { 0 }])));
         let masked = Target::of_view(&path, Some(&top), &INTRINSICS, 8).unwrap();
         assert_eq!(masked.intrinsics, intrinsics);
@@ -210,7 +230,7 @@ mod tests {
         let photo = saved(dir.path(), "photo.png", RgbImage::new(60, 40));
         let small = saved(dir.path(), "small.png", GrayImage::new(6, 4));
         let black = saved(dir.path(), "black.png", GrayImage::new(60, 40));
-        let error = |mask: &Path| Target::of_photo(&photo, Some(mask), &INTRINSICS, 6).unwrap_err().to_string();
+        let error = |mask: &Path| Target::of_photo(&photo, None, Some(mask), &INTRINSICS, 6).unwrap_err().to_string();
         let (wrong, nothing) = (error(&small), error(&black));
         assert!(wrong.contains("small.png") && wrong.contains("60×40") && wrong.contains("6×4"), "{wrong}");
         assert!(nothing.contains("black.png") && nothing.contains("nothing"), "{nothing}");

@@ -9,7 +9,7 @@ use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Light, Model, Pose6};
 use srn_data::camera::Axes;
 
-use super::files::{ObjectArgs, Picture, PoseSource, create_dir, mask_of, model_side, srn_instance};
+use super::files::{Masks, ObjectArgs, Picture, PoseSource, create_dir, model_side, srn_instance};
 use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
@@ -20,7 +20,7 @@ use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_exis
 #[derive(Args, Debug)]
 pub struct Estimate {
     /// Pictures of any size and colour type; transparency becomes white. A photograph that lies in no SRN folder is cut to a square
-    /// around what transparency and --mask leave of it; with neither, to its middle. All are searched for in one batch.
+    /// around what transparency, --cutout and --mask leave of it; with neither, to its middle. All are searched for in one batch.
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
     #[command(flatten)]
@@ -32,8 +32,12 @@ pub struct Estimate {
     /// With --unseen and one picture: write the model with this object, for further pictures of it.
     #[arg(long, value_name = "FILE", requires = "unseen")]
     save_model: Option<PathBuf>,
-    /// What counts in a picture: white, or opaque. What is black (something before the object, a cluttered background) has no part in the
-    /// search. A file, once or once per picture, or a folder with files called like the pictures.
+    /// What of a picture is the object, as a segmentation says: white, or opaque. What is black becomes background, as what is transparent does, so that the
+    /// object's outline helps. A file, once or once per picture, or a folder with files called like the pictures.
+    #[arg(long, value_name = "FILE|DIR")]
+    cutout: Vec<PathBuf>,
+    /// What counts in a picture: white, or opaque. What is black (something before the object) has no part in the search: the object may go on there.
+    /// Like --cutout.
     #[arg(long, value_name = "FILE|DIR")]
     mask: Vec<PathBuf>,
     /// Where to start: `around84`, all around; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file
@@ -223,13 +227,14 @@ fn poses(flag: &str, sources: &[PoseSource], images: &[PathBuf], notation: &Nota
 
 fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> Result<Vec<Picture>> {
     let truths = poses("--truth", &args.truth, &args.images, notation)?;
+    let cutouts = each("--cutout", "masks", &args.cutout, &args.images)?;
     let masks = each("--mask", "masks", &args.mask, &args.images)?;
     let mut names = HashSet::new();
     let mut pictures = Vec::new();
-    for ((path, mask), truth) in masks.into_iter().zip(truths) {
-        let mask = mask.map(|mask| mask_of(mask, path)).transpose()?;
+    for (((path, cutout), (_, mask)), truth) in cutouts.into_iter().zip(masks).zip(truths) {
+        let masks = Masks { cutout: cutout.map(PathBuf::as_path), mask: mask.map(PathBuf::as_path) };
         let instance = if args.unseen { Some("0") } else { args.object.instance.as_deref() };
-        let picture = Picture::open(path, mask.as_deref(), model, side, instance, &args.object.camera)?;
+        let picture = Picture::open(path, masks, model, side, instance, &args.object.camera)?;
         let mut picture = Picture { truth, ..picture };
         while !names.insert(picture.name.clone()) {
             picture.name += "-again";

@@ -35,6 +35,15 @@ pub struct ObjectArgs {
     pub camera: CameraArgs,
 }
 
+/// Masks of a picture: files, or folders with files called like the picture.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Masks<'a> {
+    /// What is black there is background, as if it were transparent.
+    pub cutout: Option<&'a Path>,
+    /// What is black there does not count.
+    pub mask: Option<&'a Path>,
+}
+
 /// Flags that describe the camera; at most one of them.
 #[derive(Args, Clone, Debug)]
 #[group(multiple = false)]
@@ -147,10 +156,10 @@ impl Picture {
     }
 
     /// Reads a picture as a square of `side` pixels. In an SRN folder the intrinsics and the instance's name are found beside it; a
-    /// picture from elsewhere is cut around what its mask and transparency leave.
+    /// picture from elsewhere, or with a mask that cuts it out, is cut around what masks and transparency leave.
     pub fn open(
         path: &Path,
-        mask: Option<&Path>,
+        masks: Masks,
         model: &Model,
         side: u32,
         instance: Option<&str>,
@@ -168,8 +177,12 @@ impl Picture {
         };
         let folder = dir.as_deref().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
         let instance = instance_of(model, instance.or(folder.as_deref())).map_err(|error| about(&error.to_string()))?;
-        let read = if dir.is_some() { Target::of_view } else { Target::of_photo };
-        let target = read(path, mask, &intrinsics, side as usize)?;
+        let file = |mask: Option<&Path>| mask.map(|mask| mask_of(mask, path)).transpose();
+        let (cutout, mask) = (file(masks.cutout)?, file(masks.mask)?);
+        let target = match (&dir, &cutout) {
+            (Some(_), None) => Target::of_view(path, mask.as_deref(), &intrinsics, side as usize)?,
+            _ => Target::of_photo(path, cutout.as_deref(), mask.as_deref(), &intrinsics, side as usize)?,
+        };
         let [fx, fy, cx, cy] = target.intrinsics.map(f64::from);
         Ok(Picture {
             name: format!("{}-{stem}", model.instance_name(instance)),
@@ -187,7 +200,7 @@ impl Picture {
 }
 
 /// The mask of a picture: this file, or the one in this folder that is called like the picture.
-pub fn mask_of(mask: &Path, picture: &Path) -> Result<PathBuf> {
+fn mask_of(mask: &Path, picture: &Path) -> Result<PathBuf> {
     if mask.is_dir() { Ok(mask_in(mask, picture)?) } else { Ok(mask.into()) }
 }
 

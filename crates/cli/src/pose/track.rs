@@ -7,7 +7,7 @@ use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Tracked, Tracker};
 
 use super::draw;
-use super::files::{Animation, ObjectArgs, Picture, PoseSource, mask_of, model_side};
+use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side};
 use super::notation::NotationArgs;
 use super::search::{PoseError, SearchArgs, Starts, query, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
@@ -26,7 +26,10 @@ pub struct Track {
     frames: Vec<PathBuf>,
     #[command(flatten)]
     object: ObjectArgs,
-    /// Folder with masks called like the frames; see `estimate`.
+    /// Folder with masks called like the frames, of what is the object; see `estimate`.
+    #[arg(long, value_name = "DIR")]
+    cutout: Option<PathBuf>,
+    /// Folder with masks called like the frames, of what counts; see `estimate`.
     #[arg(long, value_name = "DIR")]
     mask: Option<PathBuf>,
     /// Pose in the first frame. Default: searched for all around.
@@ -90,8 +93,8 @@ pub fn run(args: &Track) -> Result<bool> {
     let (mut errors, mut searches, mut trusted, mut count) = (Vec::new(), 0, true, 0);
     for path in std::iter::once(Ok(first)).chain(frames) {
         let path = path?;
-        let mask = args.mask.as_ref().map(|mask| mask_of(mask, &path)).transpose()?;
-        let picture = Picture::open(&path, mask.as_deref(), &model, side, args.object.instance.as_deref(), &args.object.camera)?;
+        let masks = Masks { cutout: args.cutout.as_deref(), mask: args.mask.as_deref() };
+        let picture = Picture::open(&path, masks, &model, side, args.object.instance.as_deref(), &args.object.camera)?;
         let starts = args.search.starts(&Starts::Around84, &model, &picture, side, None, &notation)?;
         let tracker = match &mut tracker {
             Some(tracker) => tracker,
