@@ -186,8 +186,9 @@ impl Options {
         self
     }
 
-    /// The same with all starts, and no others, in every phase.
+    /// The same with all starts as they are given, and no others, in every phase.
     pub fn without_culling(mut self) -> Self {
+        self.align = false;
         self.min_starts = 0;
         self.phases.iter_mut().filter(|phase| !phase.dilate).for_each(|phase| phase.keep = usize::MAX);
         self

@@ -78,7 +78,7 @@ pub fn search(
         bar.set_message(name.clone());
         found.push(run(&search, on, pictures, starts, |progress| {
             if progress.search == 0 {
-                bar.set_position(i as u64 * steps + u64::from(progress.step));
+                bar.set_position(i as u64 * steps + u64::from(progress.step).min(steps));
             } else {
                 bar.set_message(format!("{name}, once more"));
             }
