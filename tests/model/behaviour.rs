@@ -182,7 +182,7 @@ fn light_is_made_up_for() {
             Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
         };
         let phases = [10, 10].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, dilate: false }).into();
-        let options = Options { phases, min_starts: 0, ..Options::default() };
+        let options = Options { phases, min_starts: 0, align: false, ..Options::default() };
         let search = |queries: &[Query]| estimate(&engine, model, queries, &options, |_| Ok(())).unwrap();
         let [unknown, known] = [false, true].map(|is_known| search(&[0, 1, 2].map(|k| query(k, is_known))));
         let [off, errors] = [&unknown, &known].map(|found| {
@@ -211,6 +211,38 @@ fn light_is_made_up_for() {
     assert!(wrong(vec![0.5; 7]).contains("coverage of 784"));
     assert!(wrong(vec![1.5; 784]).contains("from 0 to 1"));
     assert!(wrong(vec![f32::NAN; 784]).contains("from 0 to 1"));
+}
+
+/// A camera that looks from the right side, but from too far and past the object, is moved where the picture is cut out, and only there.
+#[test]
+fn starts_are_aligned_with_what_is_cut_out() {
+    const SIDE: u32 = 28;
+    let (ref model, instance, intrinsics) = shipped_forklift();
+    for engine in engines() {
+        let truth = camera::fixed24(1.3)[2];
+        let shown = Renderer::new(&engine, model, 1, SIDE, SIDE).unwrap().render(&[instance], &[(truth, intrinsics)], 0).unwrap();
+        let is_object = |rgb: &[f32]| f32::from(u8::from(rgb.iter().any(|colour| *colour < 0.9)));
+        let coverage: Vec<f32> = shown.rgb.chunks(3).map(is_object).collect();
+        let mut start = truth;
+        start.w_axis = (1.3 * truth.w_axis.truncate()).extend(1.0);
+        let start = start * glam::DMat4::from_rotation_y(0.06);
+        let phases = vec![Phase { steps: 0, stride: 1, keep: 1, light: false, dilate: false }];
+        let options = Options { phases, min_starts: 0, ..Options::default() };
+        let query = |coverage: Option<Vec<f32>>| {
+            let (rgb, width, height, starts) = (shown.rgb.clone(), SIDE, SIDE, vec![start]);
+            Query { instance, rgb, weights: None, coverage, dilation: 0.0, width, height, intrinsics, starts }
+        };
+        let queries = [query(None), query(Some(coverage))];
+        let errors = |options: &Options| {
+            let found = estimate(&engine, model, &queries, options, |_| Ok(())).unwrap();
+            [0, 1].map(|k| camera::pose_error(&found[k].pose.to_matrix(), &truth))
+        };
+        let [given, moved] = errors(&options);
+        println!("{engine}: {given:.3?}, {moved:.3?}");
+        // Measured: 3.4° and 0.39 as given, 0.75° and 0.024 moved.
+        assert!(moved.0 < 1.0 && moved.1 < 0.1 && given.1 > 0.3, "{engine}");
+        assert_eq!(errors(&options.without_culling()), [given; 2], "{engine}");
+    }
 }
 
 /// A search that is too short goes on until it has arrived; another picture beside it, that has, is left alone.
@@ -289,7 +321,7 @@ fn masks_are_tried_dilated() {
         };
         let phase = |steps, keep, dilate| Phase { steps, stride: 1, keep, light: false, dilate };
         let phases = vec![phase(0, 2, false), phase(2, 1, true), phase(1, 2, false)];
-        let options = Options { phases, min_starts: 0, anew: 0, ..Options::default() };
+        let options = Options { phases, min_starts: 0, align: false, anew: 0, ..Options::default() };
         let mut steps = Vec::new();
         let mut search = |queries: &[Query]| {
             estimate(&engine, model, queries, &options, |progress| {
