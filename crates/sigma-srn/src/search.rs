@@ -3,7 +3,7 @@
 use glam::DMat4;
 use web_time::Instant;
 
-use crate::confidence::{Confidence, Doubt, unexplained, unexplained_doubt};
+use crate::confidence::{Confidence, Doubt, hidden_doubt, unexplained, unexplained_doubt};
 use crate::estimator::{Effort, Estimate, Options, Progress, Query, at_work, estimate};
 use crate::renderer::{View, render_views};
 use crate::unseen::estimate_unseen;
@@ -156,7 +156,9 @@ impl Search {
         let doubt = match self.accept {
             Some(_) if !estimate.loss.is_finite() => Some(Doubt::Loss),
             Some(most) => unexplained_doubt(unexplained, most),
-            None => doubt(&estimate, unexplained),
+            None => {
+                doubt(&estimate, unexplained).or_else(|| hidden_doubt(query.weights.as_deref()?, &view, query.width as usize))
+            }
         };
         let confidence = Confidence::of(model, query.instance, &estimate);
         let world_from_camera = estimate.pose.to_matrix();

@@ -189,6 +189,9 @@ pub fn run(args: &Estimate) -> Result<bool> {
         }
         eprintln!("pictures in {}", dir.display());
     }
+    if args.cutout.is_empty() && found.iter().any(|found| found.doubt == Some(Doubt::Hidden)) {
+        eprintln!("--mask says nothing of what it hides; a segmentation of the object is for --cutout, and its outline counts");
+    }
     Ok(found.iter().all(Found::is_trusted))
 }
 
