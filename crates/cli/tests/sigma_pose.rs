@@ -622,6 +622,26 @@ fn a_mask_takes_pixels_out_of_the_search() {
     fail_with("--fov 53.5 --instance seat --cutout small.png", &["small.png", "8×8"]);
 }
 
+/// The true pose, of which a mask leaves a patch in the middle of the object in sight.
+#[test]
+fn a_pose_behind_a_mask_is_not_trusted() {
+    let home = TempDir::new().unwrap();
+    let dir = home.path();
+    let patch = |x: u32, y: u32| image::Luma([if [x, y].iter().all(|at| (26..38).contains(at)) { 255u8 } else { 0 }]);
+    image::GrayImage::from_fn(64, 64, patch).save(dir.join("patch.png")).unwrap();
+    let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/models/compact.safetensors");
+    let there = format!("--model {model} --executor cpu --starts {TEST}/valve/pose/000005.txt --no-cull --steps 1");
+    let estimate = |mask: &str, code: i32| {
+        let output = sigma_pose(dir, &format!("estimate {TEST}/valve/rgb/000005.png {there} --json {mask}"));
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(code), "{said}");
+        let report = json(&String::from_utf8(output.stdout).unwrap());
+        (report["images"][0]["doubt"].clone(), said.contains("--cutout"))
+    };
+    assert_eq!(estimate("", 0), (Value::Null, false));
+    assert_eq!(estimate("--mask patch.png", 1), ("hidden".into(), true));
+}
+
 /// Pictures cut out with a rim of the table around the object, or with too little of it.
 #[test]
 fn a_mask_need_not_be_exact() {

@@ -183,8 +183,8 @@ pub fn unexplained_doubt(unexplained: f64, most: f64) -> Option<Doubt> {
 
 /// How much darker than white a pixel is that shows an object, all channels together (they span 6).
 const SHOWN: f64 = 0.3;
-/// The part of an object that may lie where a picture does not count, where no more of its outline lies where it does. Of 44 pictures of ten objects
-/// all around which nothing counted, right poses hid 0.03 to 0.10 of the object, wrong ones 0.11 to 0.77 (`docs/accuracy.md`).
+/// The part of an object that may lie where a picture does not count, where no more of its outline lies where it does. Of 80 searches for ten objects
+/// all around which nothing counted, right poses hid 0.03 to 0.13 of the object, wrong ones 0.11 to 0.77 (`docs/accuracy.md`).
 const HIDDEN: f64 = 0.1;
 
 /// The doubt where more than a tenth of what a view shows `[height, width, 3]` lies where a picture does not count (`weights`, `[height, width]`), and hardly
