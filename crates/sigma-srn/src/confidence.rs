@@ -189,7 +189,7 @@ const HIDDEN: f64 = 0.1;
 
 /// The doubt where more than a tenth of what a view shows `[height, width, 3]` lies where a picture does not count (`weights`, `[height, width]`), and hardly
 /// any of its outline where it does.
-pub fn hidden_doubt(weights: &[f32], view: &[f32], width: usize) -> Option<Doubt> {
+pub(crate) fn hidden_doubt(weights: &[f32], view: &[f32], width: usize) -> Option<Doubt> {
     let counts = |pixel: usize| f64::from(weights[pixel].clamp(0.0, 1.0));
     let darkness: Vec<f64> =
         view.chunks_exact(3).map(|pixel| pixel.iter().map(|colour| f64::from(1.0 - colour.clamp(-1.0, 1.0))).sum()).collect();
