@@ -161,7 +161,7 @@ fn two_shot(engine: &Engine, args: &Evaluate, model: &Model, mut set: Dataset, s
     let instances = || (0..).zip(&set.instances);
     let of = |(i, instance): (u32, &'_ Instance)| fitted(instance.views.len()).map(|k| (i, k));
     let shown: Vec<_> = instances().flat_map(of).map(|(i, k)| (i, &set.instances[i as usize].views[k])).collect();
-    let fitted_by = |fit: Fit| fit.run(engine, model, names.clone(), &shown, side);
+    let fitted_by = |fit: Fit| -> Result<Model> { Ok(fit.run(engine, model, names.clone(), &shown, side)?.0) };
     let (ours, paper) = (fitted_by(Fit::default())?, fitted_by(Fit::default().of_codes())?);
     let unseen = instances().map(|(i, instance)| {
         let others = instance.views.iter().enumerate().filter(|(k, _)| !fitted(instance.views.len()).contains(k));

@@ -11,6 +11,7 @@ use sigma_srn::{Engine, Model, Train, Trainer, stream};
 use srn_data::camera::uniform_sphere;
 use srn_data::{Instance, LoadedView};
 
+use super::reflection::{self, Reflection};
 use super::settings::{positive, up_to};
 use super::{Shown, psnr_of_each, render, training_batch};
 use crate::common::{self, EngineArgs, Result};
@@ -23,10 +24,10 @@ const STEPS: u64 = 500;
 const LEARNING_RATE: f64 = 3e-3;
 const NETWORK_STEPS: u64 = 400;
 const NETWORK_LEARNING_RATE: f64 = 1e-3;
-const RAYS: u32 = 256;
+const RAYS: u32 = 128;
 /// Views of known objects that the networks are held to, and how many of them in a step.
 const KNOWN: usize = 64;
-const KNOWN_IN_STEP: usize = 8;
+const KNOWN_IN_STEP: usize = 16;
 /// Part of the networks' rays that is drawn where a picture is not of one colour.
 const DETAIL: f64 = 0.5;
 
@@ -76,6 +77,9 @@ pub struct Fit {
     /// Learning rate of Adam for these.
     #[arg(long, value_name = "RATE", default_value_t = NETWORK_LEARNING_RATE, value_parser = positive)]
     network_lr: f64,
+    /// Do not look for objects that are their own mirror images, whose pictures are used from the other side, too, when the networks learn.
+    #[arg(long)]
+    no_reflections: bool,
     /// Random rays per image and step, at most a whole image.
     #[arg(long, value_name = "N", default_value_t = RAYS, value_parser = up_to(u32::MAX))]
     rays: u32,
@@ -87,7 +91,7 @@ pub struct Fit {
 impl Default for Fit {
     fn default() -> Self {
         let (steps, lr, network_steps, network_lr) = (STEPS, LEARNING_RATE, NETWORK_STEPS, NETWORK_LEARNING_RATE);
-        Fit { steps, lr, network_steps, network_lr, rays: RAYS, seed: 0 }
+        Fit { steps, lr, network_steps, network_lr, no_reflections: false, rays: RAYS, seed: 0 }
     }
 }
 
@@ -97,8 +101,16 @@ impl Fit {
         Fit { network_steps: 0, ..self }
     }
 
-    /// The trained model with these instances instead of its own, fitted to views of them.
-    pub fn run(&self, engine: &Engine, trained: &Model, names: Vec<String>, views: &[Shown], side: u32) -> Result<Model> {
+    /// The trained model with these instances instead of its own, fitted to views of them, and each one's reflections, as far as it was
+    /// asked for them.
+    pub fn run(
+        &self,
+        engine: &Engine,
+        trained: &Model,
+        names: Vec<String>,
+        views: &[Shown],
+        side: u32,
+    ) -> Result<(Model, Vec<Vec<Reflection>>)> {
         let bar = common::progress(self.steps + self.network_steps, "fitting");
         let rays = self.rays.min(side * side);
         let model = trained.with_new_instances(names.clone())?;
@@ -118,10 +130,15 @@ impl Fit {
         drop(trainer);
         if self.network_steps == 0 {
             bar.finish_and_clear();
-            return Ok(fitted);
+            return Ok((fitted, vec![vec![]; names.len()]));
         }
+        let reflections =
+            if self.no_reflections { vec![vec![]; names.len()] } else { reflection::reflections(engine, &fitted, views, side)? };
+        let images = reflection::images(views, side, |instance| &reflections[instance as usize]);
+        let images = images.iter().map(|(instance, view)| (*instance, view));
+        let views: Vec<Shown> = views.iter().copied().chain(images).collect();
         // Instances: the new ones, then the known ones.
-        let known = self.known(engine, trained, views, side)?;
+        let known = self.known(engine, trained, &views, side)?;
         let all = (0..trained.layout.instances).map(|instance| trained.instance_name(instance));
         let all = names.iter().cloned().chain(all).collect();
         let joined = trained.with_codes(all, [fitted.codes()?, trained.codes()?].concat())?;
@@ -137,7 +154,7 @@ impl Fit {
         bar.finish_and_clear();
         let joined = trainer.model()?;
         let codes = joined.codes()?[..fitted.codes()?.len()].to_vec();
-        Ok(joined.with_codes(names, codes)?)
+        Ok((joined.with_codes(names, codes)?, reflections))
     }
 
     /// Views of the trained model's own instances, drawn at random, from as far away as it was trained, through the first view's lens.
@@ -177,23 +194,25 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
 
     let engine = args.engine.open()?;
     let names = set.instances.iter().map(|instance| instance.name.clone()).collect();
-    let model = args.fit.run(&engine, &model, names, &fitted, side)?;
+    let (model, reflections) = args.fit.run(&engine, &model, names, &fitted, side)?;
     let mut results = vec![];
     for (instance, (fitted, unseen)) in (0..).zip(&split) {
         let views: Vec<Shown> = fitted.iter().chain(unseen).map(|&view| (instance, view)).collect();
         let psnr = psnr_of_each(&render(&engine, &model, &views, side)?, &views);
         let (fitted, unseen) = psnr.split_at(fitted.len());
         let name = model.instance_name(instance);
-        results.push(Fitted { instance: name, fitted_psnr: mean(fitted), unseen_psnr: mean(unseen) });
+        let reflections = reflections[instance as usize].iter().map(|reflection| reflection.name).collect();
+        results.push(Fitted { instance: name, fitted_psnr: mean(fitted), unseen_psnr: mean(unseen), reflections });
     }
     model.save(&args.out)?;
     if args.json {
         println!("{:#}", serde_json::json!({ "model": args.out, "instances": results }));
     } else {
-        println!("{:<24} {:>14} {:>14}", "instance", "fitted views", "unseen views");
-        for Fitted { instance, fitted_psnr, unseen_psnr } in &results {
+        println!("{:<24} {:>14} {:>14}  reflections", "instance", "fitted views", "unseen views");
+        for Fitted { instance, fitted_psnr, unseen_psnr, reflections } in &results {
             let [fitted, unseen] = [fitted_psnr, unseen_psnr].map(|psnr| psnr.map_or("-".into(), |psnr| format!("{psnr:.2} dB")));
-            println!("{instance:<24} {fitted:>14} {unseen:>14}");
+            let reflections = if reflections.is_empty() { "-".into() } else { reflections.join(" ") };
+            println!("{instance:<24} {fitted:>14} {unseen:>14}  {reflections}");
         }
         println!("model: {out}");
     }
@@ -207,6 +226,8 @@ struct Fitted {
     fitted_psnr: Option<f64>,
     /// None if there are no other views than the fitted ones.
     unseen_psnr: Option<f64>,
+    /// Those of the object, each by the coordinates that it turns round.
+    reflections: Vec<&'static str>,
 }
 
 /// The views to fit to, and some of the others.
