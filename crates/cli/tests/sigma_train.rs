@@ -294,6 +294,8 @@ fn adapt_fits_codes_then_networks() {
     let fitted = |args: &str| -> [f64; 2] {
         let result: Value = serde_json::from_str(&succeed(&format!("{args} --json"))).unwrap();
         assert_eq!(result["instances"][0]["instance"], "seat");
+        // So short a training does not know the seat, nor that it is symmetric.
+        assert_eq!(result["instances"][0]["reflections"], serde_json::json!([]));
         ["fitted_psnr", "unseen_psnr"].map(|psnr| result["instances"][0][psnr].as_f64().unwrap())
     };
     let [by_code, unseen] = fitted(&format!("{adapt} {}", new.display()));

@@ -28,7 +28,7 @@ mod trainer;
 mod unseen;
 
 pub use camera::{Intrinsics, Pose6};
-pub use confidence::{Calibration, Confidence, Doubt, Seen};
+pub use confidence::{Calibration, Confidence, Doubt, Seen, unexplained};
 pub use descent::{Descent, Loss, Method, Shape};
 pub use engine::Engine;
 pub use error::Error;

@@ -20,7 +20,7 @@ struct Cli {
 enum Command {
     /// Train a model from nothing, or go on with a run that was stopped.
     Fit(fit::FitArgs),
-    /// Fit latent codes of new instances to a few views of each, all networks frozen.
+    /// Fit new instances to a few views of each: their latent codes, then the networks, too.
     Adapt(adapt::AdaptArgs),
     /// Make a model of a checkpoint of the authors' PyTorch code.
     Import(torch::ImportArgs),
