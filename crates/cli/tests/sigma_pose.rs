@@ -59,6 +59,15 @@ fn files(dir: &Path) -> Vec<String> {
     names
 }
 
+/// Views of a test object as an instance of its own.
+fn copy_views(object: &str, views: &[&str], to: &Path) {
+    let of_view = |view: &&str| [format!("rgb/{view}.png"), format!("pose/{view}.txt")];
+    for file in views.iter().flat_map(of_view).chain(["intrinsics.txt".into()]) {
+        fs::create_dir_all(to.join(&file).parent().unwrap()).unwrap();
+        fs::copy(format!("{TEST}/{object}/{file}"), to.join(&file)).unwrap();
+    }
+}
+
 fn matrix(value: &Value) -> DMat4 {
     let rows: [[f64; 4]; 4] = serde_json::from_value(value.clone()).unwrap();
     DMat4::from_cols_array_2d(&rows).transpose()
@@ -154,13 +163,10 @@ fn a_calibrated_model_states_deviations() {
     // A network of random weights finds nothing: only a start at the truth is near enough to learn from.
     let truth = fs::read_to_string(format!("{TEST}/chicken/pose/000003.txt")).unwrap().replace('\n', " ");
     fs::write(dir.join("truth.txt"), truth).unwrap();
-    fs::create_dir_all(dir.join("one/chicken/rgb")).unwrap();
-    fs::create_dir_all(dir.join("one/chicken/pose")).unwrap();
-    for file in ["rgb/000003.png", "pose/000003.txt", "intrinsics.txt"] {
-        fs::copy(format!("{TEST}/chicken/{file}"), dir.join("one/chicken").join(file)).unwrap();
-    }
+    copy_views("chicken", &["000003"], &dir.join("one/chicken"));
     let calibrate = "calibrate --model model.safetensors --data one --steps 1 --executor cpu --starts truth.txt --no-cull";
     let found: Value = serde_json::from_str(&run(dir, &format!("{calibrate} --json --out calibrated.safetensors"), 0)).unwrap();
+    let found = &found["calibration"];
     assert_eq!((found["views"].as_u64(), found["rival"].as_f64()), (Some(1), Some(0.0)), "{found}");
     let [model, calibrated] = ["model", "calibrated"].map(|name| Model::load(&dir.join(format!("{name}.safetensors"))).unwrap());
     assert_eq!(model.parameters, calibrated.parameters);
@@ -180,6 +186,38 @@ fn a_calibrated_model_states_deviations() {
     assert!(confidence["rotation_deg"].as_f64().unwrap() > 0.0 && report["images"][0]["trusted"] == true, "{report}");
     let evaluate = "evaluate --model calibrated.safetensors --data one --starts truth.txt --steps 1 --no-cull --executor cpu";
     assert!(run(dir, evaluate, 0).contains("ellipsoid of 1 of 1"));
+}
+
+/// What poses of new objects are worth, learnt from some, holds for those that the model is adapted to, as far as they are fitted as well.
+#[test]
+fn adapted_models_state_deviations_of_new_objects() {
+    let home = home();
+    let dir = home.path();
+    copy_views("seat", &["000000", "000001", "000002"], &dir.join("new/seat"));
+    copy_views("seat", &["000001", "000002"], &dir.join("two/seat"));
+    fs::copy(format!("{TEST}/seat/pose/000001.txt"), dir.join("truth.txt")).unwrap();
+    let options = "--steps 1 --executor cpu --starts truth.txt --no-cull";
+    let calibrate = format!("calibrate --model model.safetensors {options} --out calibrated.safetensors");
+    fail(dir, &calibrate, &["--data"]);
+    fail(dir, &format!("{calibrate} --heldout two"), &["seat", "has 2 views"]);
+    let said = run(dir, &format!("{calibrate} --heldout new --symmetries"), 0);
+    assert!(
+        said.starts_with("new objects, by two views of each:\n1 views, 0 of them more than 10° off") && said.contains('±'),
+        "{said}"
+    );
+    let calibrated = Model::load(&dir.join("calibrated.safetensors")).unwrap().metadata;
+    assert!(calibrated.calibration.is_none() && calibrated.calibration_of_new.is_some());
+
+    for (args, is_stated) in [("", true), ("--views 1", false), ("--network-steps 9", false), ("--steps 9", false)] {
+        let adapt = format!("adapt --model calibrated.safetensors --data new --out new.safetensors --executor cpu {args}");
+        let done =
+            Command::new(env!("CARGO_BIN_EXE_sigma-train")).current_dir(dir).args(adapt.split_whitespace()).output().unwrap();
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        let adapted = Model::load(&dir.join("new.safetensors")).unwrap().metadata;
+        let expected = calibrated.calibration_of_new.clone().filter(|_| is_stated);
+        assert_eq!((adapted.calibration, adapted.calibration_of_new), (expected, None), "{args}");
+        fs::remove_file(dir.join("new.safetensors")).unwrap();
+    }
 }
 
 fn frames_of(animation: &Path) -> usize {
@@ -243,11 +281,7 @@ fn tables_hold_every_preset() {
     let dir = home.path();
     let args =
         "evaluate --model model.safetensors --data DATA --heldout DATA --instances 1 --views 1 --paper-views 1 --executor cpu";
-    for file in ["rgb/000003.png", "pose/000003.txt", "rgb/000004.png", "pose/000004.txt", "intrinsics.txt"] {
-        let copy = dir.join("two/seat").join(file);
-        fs::create_dir_all(copy.parent().unwrap()).unwrap();
-        fs::copy(format!("{TEST}/seat/{file}"), copy).unwrap();
-    }
+    copy_views("seat", &["000003", "000004"], &dir.join("two/seat"));
     run(dir, &format!("{args} --tables tables"), 0);
     assert_eq!(files(&dir.join("tables")), ["convergence.csv", "convergence.png", "tables.md", "views.csv", "worst.png"]);
     let tables = fs::read_to_string(dir.join("tables/tables.md")).unwrap();

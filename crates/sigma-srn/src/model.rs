@@ -155,6 +155,9 @@ pub struct Metadata {
     pub distances: Option<[f64; 2]>,
     /// How its estimates compare with known poses, if that was measured.
     pub calibration: Option<Calibration>,
+    /// The same for objects that it was not trained on, fitted to two views each: the calibration of a model that `sigma-train adapt` makes of
+    /// this one.
+    pub calibration_of_new: Option<Calibration>,
 }
 
 /// How much nearer, or farther, than all training cameras a camera may be for the model to know what it sees.
@@ -443,6 +446,7 @@ impl Model {
         };
         let json = |key: &str| text.get(key).map_or("null", String::as_str);
         let wrong = |key: &str, error: serde_json::Error| format(format!("metadata `{key}`: {error}"));
+        let calibration = |key: &str| serde_json::from_str(json(key)).map_err(|error| wrong(key, error));
         let instance_names: Option<Vec<String>> =
             serde_json::from_str(json("instance_names")).map_err(|error| wrong("instance_names", error))?;
         let ray_sphere = match number("ray_sphere") {
@@ -456,7 +460,8 @@ impl Model {
             orbit_radius: number("orbit_radius").and_then(Result::ok),
             ray_sphere,
             distances: serde_json::from_str(json("distances")).map_err(|error| wrong("distances", error))?,
-            calibration: serde_json::from_str(json("calibration")).map_err(|error| wrong("calibration", error))?,
+            calibration: calibration("calibration")?,
+            calibration_of_new: calibration("calibration_of_new")?,
         };
         Self::from_tensors(&tensors, tracing_steps, metadata)
     }
@@ -575,8 +580,11 @@ impl Model {
         if let Some(distances) = self.metadata.distances {
             text.insert("distances".into(), serde_json::json!(distances).to_string());
         }
-        if let Some(calibration) = &self.metadata.calibration {
-            text.insert("calibration".into(), serde_json::json!(calibration).to_string());
+        let Metadata { calibration, calibration_of_new, .. } = &self.metadata;
+        for (key, calibration) in [("calibration", calibration), ("calibration_of_new", calibration_of_new)] {
+            if let Some(calibration) = calibration {
+                text.insert(key.into(), serde_json::json!(calibration).to_string());
+            }
         }
         text
     }

@@ -16,7 +16,7 @@ use super::search::{On, PoseError, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::tables;
-use super::views::{self, Views};
+use super::views;
 use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
 
 /// Side of a view on the sheet, pixels.
@@ -139,7 +139,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
 
     let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();
     for ((views, source), found) in asked.iter().zip(sources).zip(found) {
-        let symmetries = args.symmetries_of(on, views)?;
+        let symmetries = if args.symmetries { Symmetries::of(on, views)? } else { Symmetries::none() };
         for ((picture, truth), found) in views.pictures.iter().zip(&views.truths).zip(found) {
             let truth = (truth, &symmetries);
             results.push((
@@ -230,16 +230,6 @@ pub(super) fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u3
     sheet::text(&mut page, 4, 8, "target | view from the estimated pose | difference; the worst first", sheet::BLACK);
     image::imageops::replace(&mut page, &grid, 0, 24);
     page
-}
-
-impl Evaluate {
-    /// Those of an instance, if they count.
-    pub(super) fn symmetries_of(&self, on: On, views: &Views) -> Result<Symmetries> {
-        let (Some(picture), Some(truth), true) = (views.pictures.first(), views.truths.first(), self.symmetries) else {
-            return Ok(Symmetries::none());
-        };
-        Symmetries::find(on, picture.instance, picture.intrinsics, truth.w_axis.truncate().length())
-    }
 }
 
 impl ViewReport {

@@ -6,6 +6,7 @@ mod draw;
 pub mod estimate;
 pub mod evaluate;
 mod files;
+mod heldout;
 mod notation;
 mod outline;
 mod record;

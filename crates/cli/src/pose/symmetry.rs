@@ -8,6 +8,7 @@ use sigma_srn::camera::around84;
 use sigma_srn::{Intrinsics, View};
 
 use super::search::{On, render};
+use super::views::Views;
 use crate::common::{Result, progress};
 
 /// Views that are compared.
@@ -30,6 +31,12 @@ impl Symmetries {
     /// Of an object that looks different from everywhere.
     pub fn none() -> Self {
         Symmetries { turns: vec![], round: None }
+    }
+
+    /// Those of the instance that these are views of, found by comparing the model's own from as far away.
+    pub fn of(on: On, views: &Views) -> Result<Self> {
+        let (Some(picture), Some(truth)) = (views.pictures.first(), views.truths.first()) else { return Ok(Symmetries::none()) };
+        Symmetries::find(on, picture.instance, picture.intrinsics, truth.w_axis.truncate().length())
     }
 
     /// Those of an instance, found by comparing the model's own views from `radius` away.

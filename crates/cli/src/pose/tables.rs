@@ -7,16 +7,16 @@ use std::time::Instant;
 use sigma_srn::{Engine, Found, Loss, Model};
 use srn_data::camera::Axes;
 use srn_data::sheet::{self, CURVES, Curve};
-use srn_data::{Dataset, Instance};
 
 use super::evaluate::{Evaluate, ViewReport, pictures_sheet, view_report};
 use super::files::{Picture, create_dir, write_png};
+use super::heldout::Heldout;
 use super::notation::Notation;
 use super::search::{LOSSES, On, PoseError, Preset, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
-use super::views::{self, Views, spread};
-use crate::common::{Result, load_model, load_set, progress, refuse_existing};
+use super::views::{self, Views};
+use crate::common::{Result, load_model, progress, refuse_existing};
 use crate::train::adapt::Fit;
 
 /// Files that are written.
@@ -25,8 +25,6 @@ const FILES: [&str; 5] = ["tables.md", "views.csv", "convergence.csv", "converge
 const PAPER_STARTS: [Starts; 2] = [Starts::Neighbor4, Starts::Fixed24];
 /// In the order of the tables.
 const STARTS: [Starts; 3] = [Starts::Neighbor4, Starts::Fixed24, Starts::Around84];
-/// Views that the code of an object is fitted to, which the model was not trained on.
-const SHOTS: usize = 2;
 /// Of a range, the part by which steps cover it most evenly, however many they are.
 const GOLDEN: f64 = 0.618_033_988_749_894_9;
 /// Searches on the page of the worst.
@@ -88,10 +86,7 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     let model = load_model(&args.model)?;
     let (side, asked) = views::open(&model, &args.data, args.instances, args.views)?;
     args.search.with(Preset::Default, None)?;
-    let heldout = args.heldout.as_ref().map(|heldout| load_set(heldout, side)).transpose()?;
-    if let Some(few) = heldout.iter().flat_map(|set| &set.instances).find(|instance| instance.views.len() <= SHOTS) {
-        return Err(format!("--heldout: `{}` has {} views; {SHOTS} are for its code", few.name, few.views.len()).into());
-    }
+    let heldout = args.heldout.as_ref().map(|heldout| Heldout::open(heldout, side, args.instances)).transpose()?;
     let paths = FILES.map(|file| dir.join(file));
     refuse_existing(paths.clone(), args.force)?;
     create_dir(dir)?;
@@ -120,8 +115,13 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     let pictures: Vec<(ViewReport, &Picture, Found)> =
         worst.iter().map(|(report, picture, found)| (report.clone(), picture, found.clone())).collect();
     write_png(&paths[4], &pictures_sheet(&pictures, side, WORST))?;
-    let unknown = heldout.map(|heldout| two_shot(&bench.engine, args, &model, heldout, side)).transpose()?;
-    if let Some(TwoShot { ours, unseen, .. }) = &unknown {
+    let adapted = |heldout: &Heldout| -> Result<_> {
+        let by = |fit: Fit| heldout.adapt(&bench.engine, &model, &fit);
+        // The paper fits codes alone.
+        Ok((by(Fit::default())?, by(Fit::default().of_codes())?, heldout.others(args.views)))
+    };
+    let unknown = heldout.as_ref().map(adapted).transpose()?;
+    if let Some((ours, _, unseen)) = &unknown {
         for starts in STARTS {
             bench.search(ours, side, unseen, setting(2, Preset::Default, &starts))?;
         }
@@ -132,7 +132,7 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     for starts in PAPER_STARTS {
         bench.search(&model, side, &few(&asked, &starts), setting(1, Preset::Paper, &starts))?;
     }
-    if let Some(TwoShot { paper, unseen, .. }) = &unknown {
+    if let Some((_, paper, unseen)) = &unknown {
         for starts in PAPER_STARTS {
             bench.search(paper, side, &few(unseen, &starts), setting(2, Preset::Paper, &starts))?;
         }
@@ -143,34 +143,6 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     }
     eprintln!("{} in {}", FILES.join(", "), dir.display());
     Ok(true)
-}
-
-/// A model with the objects of a set fitted to two views each, and the other views.
-struct TwoShot {
-    ours: Model,
-    /// Only the codes were fitted.
-    paper: Model,
-    unseen: Vec<Views>,
-}
-
-fn two_shot(engine: &Engine, args: &Evaluate, model: &Model, mut set: Dataset, side: u32) -> Result<TwoShot> {
-    set.instances = spread(set.instances, args.instances as usize);
-    let names: Vec<String> = set.instances.iter().map(|instance| instance.name.clone()).collect();
-    // Two views a quarter of the way from either end.
-    let fitted = |count: usize| -> [usize; SHOTS] { [count / 4, count - 1 - count / 4] };
-    let instances = || (0..).zip(&set.instances);
-    let of = |(i, instance): (u32, &'_ Instance)| fitted(instance.views.len()).map(|k| (i, k));
-    let shown: Vec<_> = instances().flat_map(of).map(|(i, k)| (i, &set.instances[i as usize].views[k])).collect();
-    let fitted_by = |fit: Fit| -> Result<Model> { Ok(fit.run(engine, model, names.clone(), &shown, side)?.0) };
-    let (ours, paper) = (fitted_by(Fit::default())?, fitted_by(Fit::default().of_codes())?);
-    let unseen = instances().map(|(i, instance)| {
-        let others = instance.views.iter().enumerate().filter(|(k, _)| !fitted(instance.views.len()).contains(k));
-        let others: Vec<_> = others.map(|(_, view)| view.clone()).collect();
-        let views = spread(others, args.views as usize).into_iter().map(|view| views::picture(view, i, side));
-        let (pictures, truths) = views.unzip();
-        Views { name: instance.name.clone(), dir: args.data.join(&instance.name), pictures, truths }
-    });
-    Ok(TwoShot { ours, paper, unseen: unseen.collect() })
 }
 
 /// A line of a table.
@@ -257,7 +229,7 @@ impl Bench<'_> {
                 _ if setting.preset.is_none() => Symmetries::none(),
                 Some((.., symmetries)) => symmetries.clone(),
                 None => {
-                    let found = self.args.symmetries_of(on, views)?;
+                    let found = if self.args.symmetries { Symmetries::of(on, views)? } else { Symmetries::none() };
                     self.symmetries.push((setting.table == 2, views.name.clone(), found.clone()));
                     found
                 }

@@ -120,6 +120,7 @@ impl Fit {
     ) -> Result<(Model, Vec<Vec<Reflection>>)> {
         let bar = common::progress(self.steps + self.network_steps, "fitting");
         let [rays, network_rays] = [self.rays, self.network_rays].map(|rays| rays.min(side * side));
+        let has_two_views = views.len() >= 2 * names.len();
         let model = trained.with_new_instances(names.clone())?;
         let mut trainer = Trainer::new(engine, model, Train::Codes, views.len() as u32, rays)?;
         let take = |trainer: &mut Trainer, step: u64, views: &[Shown], rays, detail, lr| -> Result<()> {
@@ -161,7 +162,11 @@ impl Fit {
         bar.finish_and_clear();
         let joined = trainer.model()?;
         let codes = joined.codes()?[..fitted.codes()?.len()].to_vec();
-        Ok((joined.with_codes(names, codes)?, reflections))
+        let mut model = joined.with_codes(names, codes)?;
+        // Of objects that are known from fewer views, or by less of a fit, it says nothing.
+        let is_as_calibrated = self.network_steps >= NETWORK_STEPS && self.steps >= STEPS && has_two_views;
+        model.metadata.calibration = model.metadata.calibration_of_new.take().filter(|_| is_as_calibrated);
+        Ok((model, reflections))
     }
 
     /// Views of the trained model's own instances, drawn at random, from as far away as it was trained, through the first view's lens.
@@ -221,6 +226,13 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
             let reflections = if reflections.is_empty() { "-".into() } else { reflections.join(" ") };
             println!("{instance:<24} {fitted:>14} {unseen:>14}  {reflections}");
         }
+        let deviations = match model.metadata.calibration {
+            Some(_) => "as those of other new objects were",
+            None => {
+                "none stated: how far off such objects are found, `sigma-pose calibrate --heldout` learns from others, fitted as these are by default"
+            }
+        };
+        println!("deviations of their poses: {deviations}");
         println!("model: {out}");
     }
     Ok(true)

@@ -102,6 +102,7 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         ray_sphere: settings.ray_sphere,
         distances: Some(distances),
         calibration: None,
+        calibration_of_new: None,
     };
     let mut trainer = Trainer::new(&engine, model, Train::Everything, settings.batch, settings.rays)?;
     if has_checkpoint {
