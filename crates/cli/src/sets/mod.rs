@@ -1,4 +1,4 @@
-//! The three public sets: which objects they have, where those come from, and which of them are held out.
+//! The public sets: which objects they have, where those come from, and which of them are held out.
 
 mod archive;
 mod fetch;
