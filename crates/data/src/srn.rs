@@ -1,8 +1,8 @@
 //! The folder layout of the SRN data sets:
 //! `<set>/<instance>/{rgb/*.png, pose/*.txt, intrinsics.txt}`.
 //!
-//! A pose file holds the 4×4 `world_from_camera`, row-major, in any line breaks, or, with 12 numbers, the first three rows of its
-//! inverse (the object in the camera). `intrinsics.txt` holds `f cx cy 0.`, the grid's barycentre `0. 0. 0.`, the near plane
+//! A pose file holds the 4×4 `world_from_camera`, row-major, in any line breaks, or, in `pose/` of an instance and with 12 numbers,
+//! the first three rows of its inverse (the object in the camera). `intrinsics.txt` holds `f cx cy 0.`, the grid's barycentre `0. 0. 0.`, the near plane
 //! `1.` and `height width`, in that order; or the nine numbers of a 3×3 matrix, which belong to the pictures as they are. Where
 //! views differ, `intrinsics/NAME.txt` holds those of one view.
 
@@ -130,9 +130,12 @@ impl InstanceFiles {
         for (slot, (folder, extensions)) in [("rgb", &["png", "jpg", "jpeg"][..]), ("pose", &["txt"])].into_iter().enumerate() {
             let folder = dir.join(folder);
             for entry in std::fs::read_dir(&folder).at(&folder)? {
-                let path = entry.at(&folder)?.path();
+                let entry = entry.at(&folder)?;
+                let path = entry.path();
+                // macOS leaves `._NAME.png` beside pictures, which is none.
+                let is_hidden = entry.file_name().to_string_lossy().starts_with('.');
                 let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-                if extensions.contains(&extension.as_str()) {
+                if extensions.contains(&extension.as_str()) && !is_hidden && !entry.file_type().at(&path)?.is_dir() {
                     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
                     views.entry(name).or_default()[slot] = Some(path);
                 }
@@ -197,7 +200,7 @@ pub fn load_square(path: &Path, intrinsics: &Intrinsics, side: usize) -> Result<
     Ok((image.centre_square().area_resample(side, side), [fx, fy, cx, cy].map(|x| x as f32)))
 }
 
-/// Reads a pose file: 16 numbers, a rigid `world_from_camera`; or 12, three rows of its inverse.
+/// Reads a pose file: 16 numbers, a rigid `world_from_camera`; or, in an instance's folder, 12, three rows of its inverse.
 pub fn read_pose(path: &Path) -> Result<DMat4> {
     rigid(path, "pose", read_pose_unchecked(path)?)
 }
@@ -233,14 +236,16 @@ pub(crate) fn read_pose_unchecked(path: &Path) -> Result<DMat4> {
     matrix(path, "pose", &read_text(path)?)
 }
 
-/// 16 finite numbers, row-major, or 12 of the inverse.
+/// 16 finite numbers, row-major, or, in an instance's folder, 12 of the inverse.
 fn matrix(path: &Path, field: &str, text: &str) -> Result<DMat4> {
     let mut values = numbers(path, field, text)?;
-    let is_inverse = values.len() == 12;
+    // Archives of SRN sets have such; in a file from elsewhere three rows may as well be those of the pose itself.
+    let in_instance = path.parent().is_some_and(|folder| folder.ends_with("pose"));
+    let is_inverse = values.len() == 12 && in_instance;
     if is_inverse {
         values.extend([0.0, 0.0, 0.0, 1.0]);
     }
-    let expected = "16 numbers, or 12 of the inverse";
+    let expected = if in_instance { "16 numbers, or 12 of the inverse" } else { "16 numbers" };
     let rows: [f64; 16] = values.as_slice().try_into().map_err(|_| Error::field(path, field, expected, values.len()))?;
     let matrix = DMat4::from_cols_array(&rows).transpose();
     Ok(if is_inverse { matrix.inverse() } else { matrix })
@@ -488,6 +493,16 @@ mod tests {
         let rows = "0 0 1 -2\n-1 0 0 0\n0 -1 0 0\n0 0 0 1\n";
         write(&path, format!("{rows}\n# the other\n{rows}")).unwrap();
         assert_eq!(read_poses(&path).unwrap(), poses);
+        // Three rows in a file from anywhere may be those of the pose; only sets have the object in the camera so.
+        let three = "0 0 1 -2\n-1 0 0 0\n0 -1 0 0\n";
+        write(&path, three).unwrap();
+        for error in [read_pose(&path).unwrap_err(), read_poses(&path).unwrap_err()] {
+            assert!(error.to_string().contains("expected 16 numbers, found 12"), "{error}");
+        }
+        let in_set = dir.path().join("pose/0.txt");
+        std::fs::create_dir(dir.path().join("pose")).unwrap();
+        write(&in_set, three).unwrap();
+        assert_eq!(read_pose(&in_set).unwrap().w_axis.to_array(), [0.0, 0.0, 2.0, 1.0]);
         for (text, words) in [
             ("# none", "at least one"),
             ("1 2 3", "line 1: expected 16"),
@@ -533,6 +548,18 @@ mod tests {
         broken("intrinsics.txt", text("50 4 4\n0 0 0\n1\n"), &["height width"]);
         broken("intrinsics.txt", text("-50 4 4\n0 0 0\n1\n8 8"), &["positive", "-50"]);
         broken("intrinsics.txt", text("50 4 4\n0 0 0\n1\n8 0"), &["positive"]);
+    }
+
+    #[test]
+    fn what_is_no_picture_is_not_listed() {
+        let (dir, ..) = made(3);
+        let thing = dir.path().join("thing");
+        for file in ["rgb/._000001.png", "rgb/.000002.png", "pose/._000001.txt"] {
+            write(thing.join(file), "no picture").unwrap();
+        }
+        std::fs::create_dir(thing.join("rgb/small.png")).unwrap();
+        let views = SrnSet::open(&thing).unwrap().load(8).unwrap().instances.remove(0).views;
+        assert_eq!(views.iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["000000", "000001", "000002"]);
     }
 
     #[test]
