@@ -1,7 +1,8 @@
 //! Photographs: masks, lenses undone, the object cut out.
 
 use crate::camera::Camera;
-use crate::error::{At, Error, Result};
+use crate::error::{Error, Result};
+use crate::pixels::decode;
 use glam::DVec2;
 use image::{RgbImage, Rgba, RgbaImage};
 use std::path::Path;
@@ -109,10 +110,6 @@ impl Picture {
         }
         Some(sum)
     }
-}
-
-fn decode(path: &Path) -> Result<image::DynamicImage> {
-    image::ImageReader::open(path).at(path)?.with_guessed_format().at(path)?.decode().at(path)
 }
 
 /// Reads the mask of a picture of this size, row by row: 255 where the object is. A mask is white there; one that is transparent,

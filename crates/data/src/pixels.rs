@@ -1,7 +1,8 @@
 //! Images as the network sees them: RGB in [-1, 1], square, area-resampled.
 
-use crate::error::{At, Result};
-use image::RgbImage;
+use crate::error::{At, Error, Result, read_bytes};
+use image::error::DecodingError;
+use image::{ImageFormat, RgbImage};
 use std::path::Path;
 
 /// A float image: `data` is row-major `[height · width, 3]`.
@@ -23,7 +24,7 @@ impl Pixels {
 
     /// The same, with the opacity of each pixel, 0 to 1.
     pub(crate) fn open_with_opacity(path: &Path) -> Result<(Self, Vec<f32>)> {
-        let rgba = image::ImageReader::open(path).at(path)?.with_guessed_format().at(path)?.decode().at(path)?.into_rgba32f();
+        let rgba = decode(path)?.into_rgba32f();
         let data = rgba.pixels().flat_map(|p| [0, 1, 2].map(|c| 2.0 * (p[c] * p[3] + (1.0 - p[3])) - 1.0)).collect();
         let opacity = rgba.pixels().map(|p| p[3]).collect();
         Ok((Self { width: rgba.width() as usize, height: rgba.height() as usize, data }, opacity))
@@ -64,6 +65,31 @@ impl Pixels {
     /// The image in 8 bits, rounded to nearest.
     pub fn to_rgb8(&self) -> RgbImage {
         rgb8(&self.data, self.width, self.height)
+    }
+}
+
+/// Reads an image file, all of it.
+pub(crate) fn decode(path: &Path) -> Result<image::DynamicImage> {
+    let bytes = read_bytes(path)?;
+    let reader = image::ImageReader::new(std::io::Cursor::new(&bytes)).with_guessed_format().at(path)?;
+    if reader.format() == Some(ImageFormat::Jpeg) && ends_early(&bytes) {
+        let source = DecodingError::new(ImageFormat::Jpeg.into(), "the picture ends early");
+        return Err(Error::Image { path: path.into(), source: image::ImageError::Decoding(source) });
+    }
+    reader.decode().at(path)
+}
+
+/// Whether a JPEG has no end: the decoder would make up what is missing, in grey. Looked for from segment to segment, since a
+/// preview among them has an end of its own; what follows the end is no part of the picture.
+fn ends_early(jpeg: &[u8]) -> bool {
+    let mut at = 2;
+    loop {
+        match jpeg.get(at..) {
+            Some([0xff, 0xd9, ..]) => return false,
+            Some([0xff, 0xc0..=0xcf | 0xda..=0xfe, high, low, ..]) => at += 2 + usize::from(u16::from_be_bytes([*high, *low])),
+            Some([_, ..]) => at += 1,
+            _ => return true,
+        }
     }
 }
 
@@ -131,6 +157,28 @@ mod tests {
     fn the_square_is_centred() {
         let square = grey(4, 2, &[0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]).centre_square();
         assert_eq!(square, grey(2, 2, &[0.1, 0.2, 0.5, 0.6]));
+    }
+
+    #[test]
+    fn a_jpeg_that_ends_early_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("photo.jpg");
+        RgbImage::from_fn(64, 64, |x, y| image::Rgb([(x * y) as u8, (3 * x) as u8, y as u8])).save(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        let read = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            Pixels::open(&path).map_err(|error| error.to_string())
+        };
+        let picture = read(&whole).unwrap();
+        assert_eq!(read(&[&whole[..], b"more, as phones append\xff"].concat()).unwrap(), picture);
+        // A segment with a preview, whose end is not that of the picture.
+        let preview = [&[0xff, 0xd8, 0xff, 0xe1, 0, 8][..], &[0xff, 0xd8, 7, 7, 0xff, 0xd9]].concat();
+        let with_preview = [&preview, &whole[2..]].concat();
+        assert_eq!(read(&with_preview).unwrap(), picture);
+        for early in [&whole[..whole.len() / 2], &whole[..whole.len() - 2], &with_preview[..with_preview.len() * 3 / 4]] {
+            let error = read(early).unwrap_err();
+            assert!(error.contains("photo.jpg") && error.contains("the picture ends early"), "{error}");
+        }
     }
 
     #[test]

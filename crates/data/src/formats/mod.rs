@@ -12,6 +12,7 @@ use crate::camera::{Axes, Camera};
 use crate::capture::{Capture, Frame, UpAxis};
 use crate::error::{At, Error, Result};
 use crate::picture::Picture;
+use crate::pixels::decode;
 use crate::srn::{picture_size, rigid, write_png};
 use glam::DMat4;
 use std::path::{Path, PathBuf};
@@ -304,19 +305,18 @@ fn copy_mask(frame: &Frame, path: &Path, pinhole: bool) -> Result<()> {
     let Some(mask) = &frame.mask else { return Ok(()) };
     let folder = path.parent().unwrap_or(path);
     std::fs::create_dir_all(folder).at(folder)?;
-    let whole = image::ImageReader::open(mask).at(mask)?.with_guessed_format().at(mask)?;
     if pinhole && !frame.camera.is_pinhole() {
         // Drawn as black on white, so that what comes from outside is background as well.
         let camera = Camera { distortion: [0.0; 5], ..frame.camera };
-        let mut inverse = whole.decode().at(mask)?.into_luma8();
+        let mut inverse = decode(mask)?.into_luma8();
         image::imageops::invert(&mut inverse);
         let mut rgb = Picture::from_luma(inverse).resample(&frame.camera, &camera);
         image::imageops::invert(&mut rgb);
         return image::DynamicImage::from(rgb).into_luma8().save(path).at(path);
     }
-    match whole.format() {
+    match image::ImageReader::open(mask).at(mask)?.with_guessed_format().at(mask)?.format() {
         Some(image::ImageFormat::Png) => std::fs::copy(mask, path).map(|_| ()).at(mask),
-        _ => whole.decode().at(mask)?.save(path).at(path),
+        _ => decode(mask)?.save(path).at(path),
     }
 }
 
