@@ -760,3 +760,10 @@ fn bad_files_are_named_with_the_place() {
 fn words_of_mirror() -> String {
     words(look_at_origin(DVec3::ONE) * DMat4::from_scale(DVec3::new(1.0, -1.0, 1.0)), 4, "\n")
 }
+        (
+            Format::Transforms,
+            "transforms.json",
+            Box::new(swap("\"fl_x\": 14.4", "\"camera_angle_x\": 40")),
+            &["frames[0]", "camera_angle_x: expected radians between 0 and π, found 40"],
+        ),
+        assert!(error.contains(path.to_str().unwrap()), "{file}: {error}");

@@ -167,6 +167,12 @@ impl Lens {
             None => [0; 2],
         }
         .map(|s| s as f64);
+        let angles = [("camera_angle_x", self.camera_angle_x, self.fl_x), ("camera_angle_y", self.camera_angle_y, self.fl_y)];
+        for (name, angle, focal) in angles {
+            if let Some(angle) = angle.filter(|angle| focal.is_none() && !(0.0 < *angle && *angle < std::f64::consts::PI)) {
+                return refuse(name, "radians between 0 and π", angle.to_string());
+            }
+        }
         let of_angle = |angle: Option<f64>, side: f64| angle.map(|angle| 0.5 * side / (0.5 * angle).tan());
         let fx = self.fl_x.or(of_angle(self.camera_angle_x, w)).or(self.fl_y).or(of_angle(self.camera_angle_y, h));
         let fy = self.fl_y.or(of_angle(self.camera_angle_y, h)).or(fx);
