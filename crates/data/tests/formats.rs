@@ -426,6 +426,49 @@ fn colmap_text_as_colmap_writes_it() {
     }
 }
 
+#[test]
+fn colmap_folders_of_folders() {
+    let cameras = "1 PINHOLE 16 12 20 21 8 6\n";
+    let images = |names: &[&str]| {
+        let line = |(k, name): (usize, &&str)| format!("{} 1 0 0 0 0 0 2 1 {name}\n\n", k + 1);
+        names.iter().enumerate().map(line).collect::<String>()
+    };
+    // Equal names in two folders: each has its own mask, or none.
+    let names = ["cam0/1.png", "cam1/1.png", "cam1/2.png"];
+    let pictures = ["images/cam0/1.png", "images/cam1/1.png", "images/cam1/2.png", "masks/cam0/1.png.png", "masks/cam1/2.png"];
+    let (one, three) = (images(&names[..1]), images(&names));
+    // Of the pieces of a reconstruction the largest; the first piece may be gone.
+    let first = [("sparse/0/cameras.txt", cameras), ("sparse/0/images.txt", one.as_str())];
+    let second = [("sparse/1/cameras.txt", cameras), ("sparse/1/images.txt", three.as_str())];
+    for files in [[&first[..], &second].concat(), second.to_vec()] {
+        let dir = folder(&files, &pictures);
+        assert_eq!(Format::detect(dir.path()).unwrap(), Format::Colmap);
+        for path in [dir.path().to_owned(), dir.path().join("sparse")] {
+            let capture = read(&path, Format::Colmap);
+            let masks = capture.frames.iter().map(|frame| Some(frame.mask.as_ref()?.strip_prefix(dir.path()).unwrap()));
+            let expected = [Some(Path::new("masks/cam0/1.png.png")), None, Some(Path::new("masks/cam1/2.png"))];
+            assert_eq!(masks.collect::<Vec<_>>(), expected);
+        }
+    }
+    // Binary models say how many images they have.
+    let dir = tempfile::tempdir().unwrap();
+    let all = made(dir.path(), "all", 5, |_| PINHOLE);
+    let few = Capture { name: "few".into(), frames: all.frames[..2].to_vec(), ..Capture::default() };
+    let [few, all] = [few, all].map(|capture| written(&capture, Format::Colmap, dir.path()));
+    fs::rename(all.join("sparse/0"), all.join("sparse/2")).unwrap();
+    fs::rename(few.join("sparse/0"), all.join("sparse/0")).unwrap();
+    assert_eq!(read(&all, Format::Colmap).frames.len(), 5);
+
+    for (file, text, other) in [("cameras.txt", cameras, "images.txt"), ("images.txt", three.as_str(), "cameras.txt")] {
+        let dir = folder(&[(&format!("sparse/0/{file}"), text)], &[]);
+        let found = formats::read(dir.path(), Format::Colmap, &ReadOptions::default()).map(|_| ());
+        for error in [found.unwrap_err(), Format::detect(dir.path()).unwrap_err()] {
+            let error = error.to_string();
+            assert!(error.contains(&format!("sparse/0/{other}: missing")) && error.contains(file), "{error}");
+        }
+    }
+}
+
 /// Reads the box's frames and puts the object into our frame.
 fn placed_box(bounds: Option<Bounds>) -> (Capture, FrameRecord, Bounds) {
     let mut capture = read(Path::new(BOX), Format::Transforms);

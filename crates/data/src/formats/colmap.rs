@@ -6,6 +6,7 @@ use crate::capture::Capture;
 use crate::error::{At, Error, Result, read_bytes, read_text};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use std::collections::BTreeMap;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// COLMAP's lens models: number, name, and where each parameter goes: `f` is both focal lengths, then the names of
@@ -40,22 +41,70 @@ struct ModelImage {
     name: String,
 }
 
-/// The folder with a model that a path means, and whether it is binary. As COLMAP does, binary is preferred.
+/// The endings of a model's files, and whether those are binary. As COLMAP does, binary is preferred.
+const ENDINGS: [(&str, bool); 2] = [("bin", true), ("txt", false)];
+
+/// The files of a model with cameras and images.
+fn files(folder: &Path, ending: &str) -> [PathBuf; 2] {
+    ["cameras", "images"].map(|name| folder.join(name).with_extension(ending))
+}
+
+/// The folders in which a path may have models, those of one reconstruction together: COLMAP numbers the pieces that it could not
+/// join.
+fn folders(path: &Path) -> [Vec<PathBuf>; 5] {
+    let numbered = |folder: &str| {
+        let entries = std::fs::read_dir(path.join(folder)).into_iter().flatten().flatten();
+        let number = |entry: std::fs::DirEntry| Some((entry.file_name().to_str()?.parse::<u32>().ok()?, entry.path()));
+        let found: BTreeMap<_, _> = entries.filter_map(number).collect();
+        found.into_values().collect()
+    };
+    [vec![path.into()], numbered("sparse"), vec![path.join("sparse")], numbered("colmap/sparse"), numbered("")]
+}
+
+/// The folder with a model that a path means, and whether it is binary; of several pieces that with the most images.
 pub(crate) fn model(path: &Path) -> Option<(PathBuf, bool)> {
-    let folders = ["", "sparse/0", "sparse", "colmap/sparse/0", "0"].map(|folder| path.join(folder));
-    folders.into_iter().find_map(|folder| {
-        let has = |ending: &str| ["cameras", "images"].iter().all(|name| folder.join(format!("{name}.{ending}")).is_file());
-        [("bin", true), ("txt", false)].into_iter().find(|(ending, _)| has(ending)).map(|(_, binary)| (folder.clone(), binary))
+    folders(path).into_iter().find_map(|pieces| {
+        let complete = pieces.into_iter().filter_map(|folder| {
+            let ending = ENDINGS.into_iter().find(|(ending, _)| files(&folder, ending).iter().all(|file| file.is_file()));
+            ending.map(|(_, binary)| (folder, binary))
+        });
+        let mut complete: Vec<_> = complete.collect();
+        // Of equal ones the first.
+        complete.sort_by_cached_key(|(folder, binary)| std::cmp::Reverse(registered(folder, *binary)));
+        complete.into_iter().next()
+    })
+}
+
+/// The number of images in a model; a file that cannot be read has none.
+fn registered(folder: &Path, binary: bool) -> u64 {
+    let [_, images] = files(folder, if binary { "bin" } else { "txt" });
+    if binary {
+        let mut count = [0; 8];
+        let read = std::fs::File::open(images).and_then(|mut file| file.read_exact(&mut count));
+        return read.map_or(0, |()| u64::from_le_bytes(count));
+    }
+    read_text(&images).and_then(|text| images_txt(&images, &text)).map_or(0, |images| images.len() as u64)
+}
+
+/// Where there is one of a model's two files, that the other is missing.
+pub(crate) fn missing(path: &Path) -> Option<Error> {
+    let models = folders(path).into_iter().flatten().flat_map(|folder| ENDINGS.map(|(ending, _)| files(&folder, ending)));
+    models.into_iter().find_map(|files| {
+        let (there, path) = match files.each_ref().map(|file| file.is_file()) {
+            [true, false] => (&files[0], &files[1]),
+            [false, true] => (&files[1], &files[0]),
+            _ => return None,
+        };
+        Some(Error::Missing { path: path.clone(), why: format!("the COLMAP model of {} needs it", there.display()) })
     })
 }
 
 /// Reads a model. Pictures are looked for in `options.images`, else in `images/` of the path given.
 pub fn read(path: &Path, options: &ReadOptions) -> Result<Capture> {
-    let missing =
+    let none =
         || Error::Missing { path: path.join("cameras.bin"), why: "a COLMAP model has it, or cameras.txt, and images".into() };
-    let (folder, binary) = model(path).ok_or_else(missing)?;
-    let file = |name: &str| folder.join(name).with_extension(if binary { "bin" } else { "txt" });
-    let (cameras_file, images_file) = (file("cameras"), file("images"));
+    let (folder, binary) = model(path).ok_or_else(|| missing(path).unwrap_or_else(none))?;
+    let [cameras_file, images_file] = files(&folder, if binary { "bin" } else { "txt" });
     let (cameras, images) = if binary {
         (cameras_bin(&cameras_file, &read_bytes(&cameras_file)?)?, images_bin(&images_file, &read_bytes(&images_file)?)?)
     } else {

@@ -71,6 +71,9 @@ impl Format {
         if crate::SrnSet::open(path).is_ok() {
             return Ok(Self::Srn);
         }
+        if let Some(error) = colmap::missing(path) {
+            return Err(error);
+        }
         let expected =
             "an SRN folder (rgb/, pose/), transforms.json, a BOP scene (scene_camera.json) or a COLMAP model (cameras.bin)";
         let found = match std::fs::read_dir(path).at(path)?.filter_map(|entry| entry.ok()).map(|entry| entry.file_name()).min() {
@@ -257,14 +260,17 @@ impl<'a> Collector<'a> {
     }
 }
 
-/// The mask of a picture in a folder of masks: `NAME.png` or, as COLMAP has it, `NAME.jpg.png`.
+/// The mask of a picture in a folder of masks: `NAME.png` or, as COLMAP has it, `NAME.jpg.png`; below the folders that the picture
+/// is in, as far as there are such.
 pub fn mask_in(folder: &Path, image: &Path) -> Result<PathBuf> {
     let [stem, whole] =
         [image.file_stem(), image.file_name()].map(|name| name.unwrap_or_default().to_string_lossy().into_owned());
     let names = [format!("{stem}.png"), format!("{whole}.png"), format!("{stem}.jpg"), whole];
-    names
-        .iter()
-        .map(|name| folder.join(name))
+    let above = image.parent().into_iter().flat_map(Path::components);
+    let above: Vec<_> = above.filter(|part| matches!(part, std::path::Component::Normal(_))).collect();
+    let folders = (0..=above.len()).map(|k| folder.join(above[k..].iter().collect::<PathBuf>()));
+    folders
+        .flat_map(|folder| names.each_ref().map(|name| folder.join(name)))
         .find(|path| path.is_file())
         .ok_or_else(|| Error::Missing { path: folder.join(&names[0]), why: format!("the mask of {}", image.display()) })
 }
