@@ -1,12 +1,13 @@
 //! `sigma-data import`, `export` and `inspect`: posed pictures in and out, and a look at them.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use glam::{DMat4, DVec3};
 use serde::Deserialize;
 use srn_data::camera::Axes;
-use srn_data::capture::{Bounds, Capture, FrameRecord, UpAxis};
+use srn_data::capture::{Bounds, Capture, Frame, FrameRecord, UpAxis};
 use srn_data::formats::{self, Format, ReadOptions, WriteOptions, Written, bop};
 use srn_data::inspect::{self, Origin};
 use srn_data::target::MARGIN;
@@ -161,8 +162,16 @@ impl Import {
             replace: self.force,
         };
         let folders = if self.hold_out.is_some() { &["train", "test"][..] } else { &[""] };
-        let dirs = captures.iter().flat_map(|capture| folders.iter().map(|folder| self.out.join(folder).join(&capture.name)));
+        let outs = folders.iter().map(|folder| self.out.join(folder));
+        let dirs = outs.flat_map(|out| captures.iter().map(move |capture| formats::folder(capture, Format::Srn, &out)));
+        let dirs: Vec<_> = dirs.collect();
+        formats::refuse_sources(&captures, &dirs)?;
         refuse_existing(dirs, self.force)?;
+        if let Some(n) = self.hold_out
+            && let Some(few) = captures.iter().find(|capture| capture.frames.len() < n as usize)
+        {
+            return Err(format!("{}: --hold-out {n} takes {n} usable views or more, not {}", few.name, few.frames.len()).into());
+        }
         let bar = progress(captures.len() as u64, "objects");
         for capture in &mut captures {
             bar.set_message(capture.name.clone());
@@ -182,6 +191,7 @@ impl Import {
                 format: format.name().into(),
                 found_by,
                 object_id: capture.object_id,
+                scene_id: capture.scene_id,
                 images,
             };
             let total = placed * before.as_ref().map_or(DMat4::IDENTITY, FrameRecord::matrix);
@@ -192,7 +202,7 @@ impl Import {
                     (Some(n), folder) => every(capture, n as usize, folder == "test"),
                     (None, _) => std::mem::take(capture),
                 };
-                let written = formats::write(&part, Format::Srn, &self.out.join(folder), 1, &options)?;
+                let written = formats::write(&part, Format::Srn, &self.out.join(folder), &options)?;
                 record.write(&written.dir)?;
                 bar.suspend(|| report(&part, &written, &format!("frame: {}", record.found_by)));
                 if written.views == 0 {
@@ -259,9 +269,9 @@ pub struct Export {
     /// Stay in the data set's frame: do not go back to that of the source it was imported from.
     #[arg(long)]
     keep_frame: bool,
-    /// bop-results: number of the scene.
-    #[arg(long, value_name = "ID", default_value_t = 1)]
-    scene: u32,
+    /// bop-results: number of the scene. Default: that which the pictures came from, else as --format bop numbers it.
+    #[arg(long, value_name = "ID")]
+    scene: Option<u32>,
     /// Write over what is there.
     #[arg(long)]
     force: bool,
@@ -301,15 +311,25 @@ impl Export {
         let format = Format::detect(&self.path)?;
         let mut captures = formats::read(&self.path, format, &ReadOptions::default())?;
         let estimates = self.poses.as_ref().map(|path| read_estimates(path)).transpose()?;
+        let scenes: Vec<_> = captures.iter().map(|capture| self.scene.or(capture.scene_id)).collect();
+        bop::number(&mut captures);
+        if let Target::Format(format) = self.format {
+            let dirs: Vec<_> = captures.iter().map(|capture| formats::folder(capture, format, &self.out)).collect();
+            formats::refuse_sources(&captures, &dirs)?;
+        }
         let mut results = vec![];
         let only = captures.len() == 1;
-        for (i, capture) in captures.iter_mut().enumerate() {
+        for (capture, scene) in captures.iter_mut().zip(scenes) {
             let instance = capture.name.clone();
             let of_view = |name: &str| {
                 // A model may call the only object otherwise.
                 let is_it = |e: &&Estimate| (only || e.instance == instance) && e.image.file_stem() == Some(name.as_ref());
                 estimates.iter().flatten().find(is_it)
             };
+            let number = |frame: &Frame| frame.name.split('_').next()?.parse().ok();
+            let numbers: Option<Vec<u32>> = capture.frames.iter().map(number).collect();
+            let numbers = numbers.unwrap_or_else(|| (0..capture.frames.len() as u32).collect());
+            let numbers: BTreeMap<_, _> = capture.frames.iter().map(|frame| frame.name.clone()).zip(numbers).collect();
             // Estimates are in the data set's frame, so they are put in before the frame is left.
             if estimates.is_some() {
                 capture.frames.retain_mut(|frame| {
@@ -323,17 +343,18 @@ impl Export {
             if !self.keep_frame {
                 capture.restore();
             }
-            let object = capture.object_id.unwrap_or(i as u32 + 1);
-            for (k, frame) in capture.frames.iter().enumerate() {
-                let estimate = of_view(&frame.name);
-                results.push(bop::Estimate {
-                    scene_id: self.scene,
-                    im_id: frame.name.split('_').next().and_then(|name| name.parse().ok()).unwrap_or(k as u32),
-                    obj_id: object,
+            let (scene_id, obj_id) = (scene.or(capture.scene_id).unwrap_or(1), capture.object_id.unwrap_or(1));
+            for frame in &capture.frames {
+                let (estimate, im_id) = (of_view(&frame.name), numbers[&frame.name]);
+                let result = bop::Estimate {
+                    scene_id,
+                    im_id,
+                    obj_id,
                     score: estimate.map_or(1.0, |estimate| 1.0 - estimate.unexplained),
                     camera_from_object: frame.camera.world_from_camera.inverse(),
                     time: estimate.map_or(-1.0, |estimate| estimate.seconds),
-                });
+                };
+                results.push((instance.clone(), result));
             }
         }
         captures.retain(|capture| !capture.frames.is_empty());
@@ -342,13 +363,28 @@ impl Export {
         }
         let Target::Format(format) = self.format else {
             refuse_to_write(&self.out, self.force)?;
+            let mut rows = BTreeMap::new();
+            for (name, bop::Estimate { scene_id, im_id, obj_id, .. }) in &results {
+                if let Some(other) = rows.insert((scene_id, im_id, obj_id), name).filter(|other| *other != name) {
+                    let what = format!("object {obj_id} in image {im_id} of scene {scene_id}");
+                    return Err(
+                        format!("{}: {other} and {name} both have {what}; export them one by one", self.path.display()).into()
+                    );
+                }
+            }
+            if self.poses.is_none() {
+                let (out, path) = (self.out.display(), self.path.display());
+                eprintln!("warning: {out}: the poses of {path} itself, with a score of 1; --poses puts estimates in their place");
+            }
+            let results: Vec<_> = results.into_iter().map(|(_, result)| result).collect();
             bop::write_results(&self.out, &results, self.force)?;
             println!("{}: {} estimates", self.out.display(), results.len());
             return Ok(true);
         };
+        refuse_existing(captures.iter().map(|capture| formats::folder(capture, format, &self.out)), self.force)?;
         let options = WriteOptions { axes: self.convention, replace: self.force, ..WriteOptions::default() };
-        for (i, capture) in captures.iter().enumerate() {
-            let written = formats::write(capture, format, &self.out, i as u32 + 1, &options)?;
+        for capture in &captures {
+            let written = formats::write(capture, format, &self.out, &options)?;
             report(capture, &written, &capture.name);
         }
         Ok(true)

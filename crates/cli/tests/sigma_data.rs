@@ -251,6 +251,77 @@ fn photographs_go_in_and_poses_come_out_as_they_came() {
 }
 
 #[test]
+fn scenes_keep_their_numbers() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+    // Two scenes of one object.
+    for scene in ["48", "49"] {
+        run(&["export", BOX, "--format", "bop", "--out", &path(scene)], 0);
+        fs::create_dir_all(dir.path().join("test")).unwrap();
+        fs::rename(dir.path().join(scene).join("000001"), dir.path().join(format!("test/0000{scene}"))).unwrap();
+    }
+    run(&["import", &path("test"), "--out", &path("set")], 0);
+    run(&["export", &path("set"), "--format", "bop", "--out", &path("back")], 0);
+    let gt = |scene: &str| json(&dir.path().join(scene).join("scene_gt.json"))["0"][0]["obj_id"].as_u64();
+    assert_eq!(["back/000048", "back/000049"].map(gt), [Some(1); 2]);
+
+    let results = |more: &[&str]| {
+        sigma_data(&[&["export", &path("set"), "--format", "bop-results", "--out", &path("found.csv")], more].concat())
+    };
+    let refused = results(&["--scene", "3"]);
+    assert!(stderr(&refused).contains("both have object 1 in image 0 of scene 3"), "{}", stderr(&refused));
+    assert!(refused.status.code() == Some(2) && !dir.path().join("found.csv").exists());
+    let said = stderr(&results(&[]));
+    assert!(said.starts_with("warning: ") && said.contains("--poses"), "{said}");
+    let csv = fs::read_to_string(dir.path().join("found.csv")).unwrap();
+    let scenes: Vec<_> = csv.lines().skip(1).map(|line| line.split(',').next().unwrap()).collect();
+    assert_eq!(scenes, ["48", "48", "48", "48", "49", "49", "49", "49"]);
+}
+
+#[test]
+fn what_cannot_be_done_leaves_everything_as_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+    let set = path("set");
+    run(&["import", BOX, "--out", &set, "--name", "a", "--side", "16"], 0);
+    run(&["import", BOX, "--out", &set, "--name", "b", "--side", "16"], 0);
+    fs::rename(dir.path().join("set"), dir.path().join("train")).unwrap();
+    let set = path("train");
+    let files = || {
+        let mut files: Vec<_> =
+            ["a", "b"].iter().flat_map(|name| fs::read_dir(path(&format!("train/{name}/rgb"))).unwrap()).collect();
+        let mut files: Vec<_> =
+            files.drain(..).map(|file| file.unwrap().path()).map(|path| (fs::read(&path).unwrap(), path)).collect();
+        files.sort();
+        files
+    };
+    let before = files();
+    assert_eq!(before.len(), 8);
+    let (one, here) = (path("train/a"), path("."));
+    for args in [
+        &["import", &set, "--out", &set][..],
+        &["import", &set, "--out", &set, "--side", "8"],
+        &["import", &one, "--out", &set],
+        &["import", &set, "--out", &here, "--hold-out", "2"],
+        &["export", &set, "--out", &set, "--format", "srn"],
+        &["export", &one, "--out", &set, "--format", "colmap"],
+    ] {
+        let refused = sigma_data(&[args, &["--force"]].concat());
+        assert!(
+            refused.status.code() == Some(2) && stderr(&refused).contains("train/a: folder to write to"),
+            "{}",
+            stderr(&refused)
+        );
+        assert!(files() == before, "{args:?}");
+        assert!(!dir.path().join("test").exists(), "{args:?}");
+    }
+    let few = sigma_data(&["import", BOX, "--out", &path("few"), "--hold-out", "5"]);
+    assert!(few.status.code() == Some(2) && stderr(&few).contains("box: --hold-out 5 takes 5"), "{}", stderr(&few));
+    assert!(!dir.path().join("few").exists());
+    run(&["import", BOX, "--out", &path("few"), "--hold-out", "4"], 0);
+}
+
+#[test]
 fn the_doctor_says_what_to_try() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("set");

@@ -22,6 +22,8 @@ pub struct Capture {
     pub applied_transform: Option<DMat4>,
     /// BOP's number of the object.
     pub object_id: Option<u32>,
+    /// BOP's number of the scene.
+    pub scene_id: Option<u32>,
     /// What an import before did to the world.
     pub record: Option<FrameRecord>,
 }
@@ -109,7 +111,6 @@ impl Capture {
     pub fn restore(&mut self) {
         if let Some(record) = self.record.take() {
             self.transform(&record.matrix().inverse());
-            self.object_id = self.object_id.or(record.object_id);
         }
     }
 
@@ -192,6 +193,9 @@ pub struct FrameRecord {
     /// BOP's number of the object.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub object_id: Option<u32>,
+    /// BOP's number of the scene.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub scene_id: Option<u32>,
     /// Of each view: the picture in the source, relative to it where it lies inside.
     pub images: std::collections::BTreeMap<String, String>,
 }

@@ -50,7 +50,7 @@ const LENS: Camera = Camera {
 };
 
 fn written(capture: &Capture, format: Format, out: &Path) -> PathBuf {
-    formats::write(capture, format, out, 1, &WriteOptions::default()).unwrap().dir
+    formats::write(capture, format, out, &WriteOptions::default()).unwrap().dir
 }
 
 /// Reads the only capture.
@@ -186,12 +186,12 @@ fn poses_are_written_the_way_each_format_names_axes() {
 
     // Another convention where the format leaves one.
     let options = WriteOptions { axes: Some(Axes::OpenGl), replace: true, ..WriteOptions::default() };
-    let out = formats::write(&capture, Format::Srn, &dir.path().join("gl"), 1, &options).unwrap().dir;
+    let out = formats::write(&capture, Format::Srn, &dir.path().join("gl"), &options).unwrap().dir;
     let again = formats::read(&out, Format::Srn, &ReadOptions { axes: Some(Axes::OpenGl), ..ReadOptions::default() }).unwrap();
     assert!(differences(&capture, &again[0])[0] < 1e-15 && differences(&capture, &read(&out, Format::Srn))[0] > 0.5);
-    let refused = formats::write(&capture, Format::Bop, dir.path(), 9, &options).unwrap_err().to_string();
+    let refused = formats::write(&capture, Format::Bop, dir.path(), &options).unwrap_err().to_string();
     assert!(refused.contains("opencv") && refused.contains("opengl"), "{refused}");
-    let exists = formats::write(&capture, Format::Srn, &dir.path().join("gl"), 1, &WriteOptions::default()).unwrap_err();
+    let exists = formats::write(&capture, Format::Srn, &dir.path().join("gl"), &WriteOptions::default()).unwrap_err();
     assert!(exists.to_string().contains("exists already"), "{exists}");
 }
 
@@ -329,6 +329,7 @@ fn bop_scenes_onboarding_and_models() {
     let dir = folder(&files, &pictures.map(|file| format!("test/000048/{file}")).each_ref().map(String::as_str));
     for path in ["test", "test/000048"] {
         let captures = formats::read(&dir.path().join(path), Format::Bop, &ReadOptions::default()).unwrap();
+        assert!(captures.iter().all(|capture| capture.scene_id == Some(48)));
         let found: Vec<_> = captures.iter().map(|c| (c.name.as_str(), c.object_id, c.frames.len())).collect();
         assert_eq!(found, [("000048-obj_000005", Some(5), 3), ("000048-obj_000007", Some(7), 1)]);
         let names: Vec<_> = captures[0].frames.iter().map(|frame| frame.name.as_str()).collect();
@@ -469,6 +470,62 @@ fn colmap_folders_of_folders() {
     }
 }
 
+#[test]
+fn no_picture_is_written_over_before_it_is_read() {
+    let dir = tempfile::tempdir().unwrap();
+    let replace = WriteOptions { replace: true, ..WriteOptions::default() };
+    for (format, path, _) in sources(dir.path()) {
+        let mut capture = read(&path, format);
+        let pictures = |capture: &Capture| capture.frames.iter().map(|frame| fs::read(&frame.image).unwrap()).collect::<Vec<_>>();
+        let before = pictures(&capture);
+        let refused = |capture: &Capture, out: &Path| {
+            let error = formats::write(capture, format, out, &replace).unwrap_err().to_string();
+            let dir = formats::folder(capture, format, out);
+            assert!(error.contains(dir.to_str().unwrap()) && error.contains("pictures of the source"), "{error}");
+            assert_eq!(pictures(capture), before, "{format:?}");
+        };
+        refused(&capture, path.parent().unwrap());
+        // A mask is lost as well, and so is what lies behind a link.
+        let out = dir.path().join("others").join(format.name());
+        let other = formats::folder(&capture, format, &out);
+        fs::create_dir_all(other.join("masks")).unwrap();
+        image::GrayImage::new(16, 12).save(other.join("masks/0.png")).unwrap();
+        capture.frames[0].mask = Some(other.join("masks/0.png"));
+        refused(&capture, &out);
+        capture.frames[0].mask = None;
+        #[cfg(unix)]
+        {
+            let images = capture.frames[0].image.clone();
+            let folder = if matches!(format, Format::Srn | Format::Bop) { "rgb" } else { "images" };
+            std::os::unix::fs::symlink(images.parent().unwrap(), other.join(folder)).unwrap();
+            refused(&capture, &out);
+            fs::remove_file(other.join(folder)).unwrap();
+            fs::create_dir(other.join(folder)).unwrap();
+            std::os::unix::fs::symlink(&images, other.join(folder).join(images.file_name().unwrap())).unwrap();
+            refused(&capture, &out);
+            fs::remove_dir_all(other.join(folder)).unwrap();
+        }
+        assert_eq!(formats::write(&capture, format, &out, &replace).unwrap().views, 3);
+    }
+}
+
+#[test]
+fn scenes_and_objects_have_numbers_of_their_own() {
+    let captures = [
+        (None, None),
+        (Some(48), Some(5)),
+        (None, Some(5)),
+        (Some(49), Some(5)),
+        (Some(7), Some(1)),
+        (Some(7), Some(2)),
+        (None, Some(1)),
+    ];
+    let mut captures = captures.map(|(scene_id, object_id)| Capture { scene_id, object_id, ..Capture::default() });
+    bop::number(&mut captures);
+    let found = captures.map(|capture| (capture.scene_id.unwrap(), capture.object_id.unwrap()));
+    assert_eq!(found, [(3, 3), (48, 5), (5, 5), (49, 5), (1, 1), (2, 2), (4, 1)]);
+}
+
 /// Reads the box's frames and puts the object into our frame.
 fn placed_box(bounds: Option<Bounds>) -> (Capture, FrameRecord, Bounds) {
     let mut capture = read(Path::new(BOX), Format::Transforms);
@@ -494,7 +551,7 @@ fn photographs_become_squares_around_the_object() {
 
     let (capture, record, _) = placed_box(Some(Bounds { centre: DVec3::ZERO, diagonal: BOX_DIAGONAL }));
     let options = WriteOptions { side: Some(48), margin: 0.1, ..WriteOptions::default() };
-    let out = formats::write(&capture, Format::Srn, dir.path(), 1, &options).unwrap();
+    let out = formats::write(&capture, Format::Srn, dir.path(), &options).unwrap();
     assert_eq!((out.views, out.skipped.len(), out.warnings.len()), (4, 0, 0), "{out:?}");
     record.write(&out.dir).unwrap();
 
@@ -519,7 +576,7 @@ fn photographs_become_squares_around_the_object() {
     let mut bare = capture.clone();
     bare.frames.iter_mut().for_each(|frame| frame.mask = None);
     let options = WriteOptions { placed: true, ..options };
-    let written = formats::write(&bare, Format::Srn, &dir.path().join("bare"), 1, &options).unwrap();
+    let written = formats::write(&bare, Format::Srn, &dir.path().join("bare"), &options).unwrap();
     assert!(written.warnings.len() == 1 && written.warnings[0].contains("4 of 4 pictures have no mask"), "{written:?}");
     for frame in &read(&written.dir, Format::Srn).frames {
         let (origin, depth) = frame.camera.project(DVec3::ZERO);
@@ -554,7 +611,7 @@ fn an_empty_mask_is_skipped_and_counted() {
     };
     (capture.frames[0].mask, capture.frames[1].mask) = (mask("good.png", 255), mask("empty.png", 0));
     let options = WriteOptions { side: Some(8), ..WriteOptions::default() };
-    let out = formats::write(&capture, Format::Srn, &dir.path().join("set"), 1, &options).unwrap();
+    let out = formats::write(&capture, Format::Srn, &dir.path().join("set"), &options).unwrap();
     assert_eq!((out.views, out.skipped.len()), (2, 1));
     assert!(out.skipped[0].contains("thing-1.png") && out.skipped[0].contains("empty"), "{:?}", out.skipped);
     // So is a picture that cannot be read; an inverted mask is remarked on.
@@ -564,9 +621,11 @@ fn an_empty_mask_is_skipped_and_counted() {
         mask.invert();
         mask.save(path).unwrap();
     });
-    let worse = formats::write(&capture, Format::Srn, &dir.path().join("worse"), 1, &options).unwrap();
+    let worse = formats::write(&capture, Format::Srn, &dir.path().join("worse"), &options).unwrap();
     assert_eq!((worse.views, worse.skipped.len(), worse.warnings.len()), (1, 2, 1), "{worse:?}");
     assert!(worse.skipped[1].contains("not a readable image") && worse.warnings[0].contains("inverted"), "{worse:?}");
+    let whole = formats::write(&capture, Format::Srn, &dir.path().join("whole"), &WriteOptions::default()).unwrap();
+    assert_eq!((whole.views, whole.skipped.len()), (2, 1), "{whole:?}");
     // What remains can be trained on.
     assert_eq!(SrnSet::open(dir.path().join("set")).unwrap().load(8).unwrap().instances[0].views.len(), 2);
 }
@@ -608,7 +667,7 @@ fn survive(format: Format, path: &Path) -> Result<(), TestCaseError> {
     inspect::place_all(&mut captures, format.up()).ok();
     let dir = tempfile::tempdir().unwrap();
     let options = WriteOptions { side: Some(8), ..WriteOptions::default() };
-    captures.iter().for_each(|capture| drop(formats::write(capture, Format::Srn, dir.path(), 1, &options)));
+    captures.iter().for_each(|capture| drop(formats::write(capture, Format::Srn, dir.path(), &options)));
     Ok(())
 }
 
@@ -737,6 +796,12 @@ fn bad_files_are_named_with_the_place() {
         ),
         (Format::Transforms, "transforms.json", Box::new(swap("\"fl_x\": 14.4", "\"fl_x\": NaN")), &["line ", "column"]),
         (Format::Transforms, "transforms.json", Box::new(swap("\"fl_x\": 14.4", "\"fl_x\": -2")), &["above 0", "-2"]),
+        (
+            Format::Transforms,
+            "transforms.json",
+            Box::new(swap("\"fl_x\": 14.4", "\"camera_angle_x\": 40")),
+            &["frames[0]", "camera_angle_x: expected radians between 0 and π, found 40"],
+        ),
         (Format::Bop, "scene_camera.json", to(text("{}")), &["scene_camera.json", "image 0", "a camera"]),
         (Format::Bop, "scene_gt.json", to(text(r#"{"0": [{"obj_id": 1}]}"#)), &["cam_R_m2c", "line 1"]),
         (Format::Bop, "scene_gt.json", to(text("{}")), &["obj", "none"]),
@@ -769,6 +834,7 @@ fn bad_files_are_named_with_the_place() {
         fs::write(path.join(file), spoil(&good)).unwrap();
         let error = formats::read(&path, format, &ReadOptions::default()).map(|_| ()).unwrap_err().to_string();
         assert!(words.iter().all(|word| error.contains(word)) && !error.contains('\n'), "{file} {words:?}: {error}");
+        assert!(error.contains(path.to_str().unwrap()), "{file}: {error}");
     }
     // One bad view of three is left out, and counted.
     let dir = tempfile::tempdir().unwrap();
@@ -803,10 +869,3 @@ fn bad_files_are_named_with_the_place() {
 fn words_of_mirror() -> String {
     words(look_at_origin(DVec3::ONE) * DMat4::from_scale(DVec3::new(1.0, -1.0, 1.0)), 4, "\n")
 }
-        (
-            Format::Transforms,
-            "transforms.json",
-            Box::new(swap("\"fl_x\": 14.4", "\"camera_angle_x\": 40")),
-            &["frames[0]", "camera_angle_x: expected radians between 0 and π, found 40"],
-        ),
-        assert!(error.contains(path.to_str().unwrap()), "{file}: {error}");

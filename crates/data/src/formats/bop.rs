@@ -8,7 +8,7 @@ use crate::capture::{Bounds, Capture};
 use crate::error::{At, Error, Result, read_text};
 use glam::{DMat3, DMat4, DVec3};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Millimetres in the unit of captures.
@@ -156,20 +156,37 @@ fn read_scene(dir: &Path, options: &ReadOptions) -> Result<Vec<Capture>> {
             }
         }
         found.capture.object_id = Some(id);
+        found.capture.scene_id = super::name_of(dir).parse().ok();
         found.capture.bounds = infos.get(&id).and_then(|info| info.bounds);
         captures.push(found.capture);
     }
     Ok(captures)
 }
 
-/// Writes the scene `out/<object>`. A unit of the capture is a metre; lenses are undone, for BOP has none.
-pub fn write(capture: &Capture, out: &Path, object: u32, options: &WriteOptions) -> Result<Written> {
-    let dir = out.join(format!("{object:06}"));
+/// Gives captures numbers of scene and object that tell them apart: those that they came with; else the scene has its object's, as
+/// BOP numbers the training pictures of objects, or the first that is free. Of captures from one scene, each becomes its own.
+pub fn number(captures: &mut [Capture]) {
+    let free =
+        |taken: &mut BTreeSet<u32>, wanted: u32| std::iter::once(wanted).chain(1..=u32::MAX).find(|number| taken.insert(*number));
+    let mut shared = BTreeMap::new();
+    captures.iter().filter_map(|capture| capture.scene_id).for_each(|scene| *shared.entry(scene).or_insert(0) += 1);
+    let own = |capture: &Capture| capture.scene_id.filter(|scene| shared[scene] == 1);
+    let mut scenes: BTreeSet<_> = captures.iter().filter_map(|capture| capture.scene_id).collect();
+    let mut objects: BTreeSet<_> = captures.iter().filter_map(|capture| capture.object_id).collect();
+    for capture in captures {
+        capture.object_id = capture.object_id.or_else(|| free(&mut objects, 1));
+        capture.scene_id = own(capture).or_else(|| free(&mut scenes, capture.object_id.unwrap_or(1)));
+    }
+}
+
+/// Writes a scene. A unit of the capture is a metre; lenses are undone, for BOP has none.
+pub(super) fn write(capture: &Capture, dir: PathBuf, options: &WriteOptions) -> Result<Written> {
+    let object = capture.object_id.unwrap_or(1);
     super::make_dir(&dir, options.replace)?;
     let (mut cameras, mut poses) = (BTreeMap::new(), BTreeMap::new());
     // Names that are numbers stay; if one is not, all are counted.
     let numbers: Option<Vec<u32>> = capture.frames.iter().map(|frame| frame.name.parse().ok()).collect();
-    let distinct = |numbers: &Vec<u32>| numbers.iter().collect::<std::collections::BTreeSet<_>>().len() == numbers.len();
+    let distinct = |numbers: &Vec<u32>| numbers.iter().collect::<BTreeSet<_>>().len() == numbers.len();
     let numbers = numbers.filter(distinct).unwrap_or_else(|| (0..capture.frames.len() as u32).collect());
     for (frame, &number) in capture.frames.iter().zip(&numbers) {
         let (_, camera) = copy_picture(frame, &dir.join("rgb"), &format!("{number:06}"), true)?;

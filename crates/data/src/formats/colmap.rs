@@ -330,9 +330,8 @@ fn least_model(camera: &Camera) -> (i32, &'static str, Vec<f64>) {
     (*number, name, names.iter().map(value).collect())
 }
 
-/// Writes `out/<name>/` with `sparse/0/`, `images/` and, where there are some, `masks/`.
-pub fn write(capture: &Capture, out: &Path, binary: bool, options: &WriteOptions) -> Result<Written> {
-    let dir = out.join(&capture.name);
+/// Writes `dir` with `sparse/0/`, `images/` and, where there are some, `masks/`.
+pub(super) fn write(capture: &Capture, dir: PathBuf, binary: bool, options: &WriteOptions) -> Result<Written> {
     super::make_dir(&dir, options.replace)?;
     let model = dir.join("sparse").join("0");
     std::fs::create_dir_all(&model).at(&model)?;

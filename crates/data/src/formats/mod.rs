@@ -150,20 +150,51 @@ pub struct Written {
     pub warnings: Vec<String>,
 }
 
-/// Writes a capture. SRN, transforms and COLMAP make the folder `out/<name>`; BOP makes the scene `out/<number>`, named as BOP
-/// names the training pictures of an object, by `capture.object_id` or else by `number`.
-pub fn write(capture: &Capture, format: Format, out: &Path, number: u32, options: &WriteOptions) -> Result<Written> {
+/// The folder that [`write`] makes for a capture: `out/<name>`; for BOP `out/<scene>`, where the capture has no number of a scene
+/// that of its object, as BOP names the training pictures of an object.
+pub fn folder(capture: &Capture, format: Format, out: &Path) -> PathBuf {
+    match format {
+        Format::Bop => out.join(format!("{:06}", capture.scene_id.or(capture.object_id).unwrap_or(1))),
+        _ => out.join(&capture.name),
+    }
+}
+
+/// Fails if a picture or mask lies in one of the folders, which are to be written to: it would be gone before it is read.
+pub fn refuse_sources(captures: &[Capture], folders: &[PathBuf]) -> Result<()> {
+    let entries = |dir: &PathBuf| std::fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut reached = std::collections::HashMap::new();
+    for dir in folders {
+        // What is to be replaced, or the folder that it is in, may be a link to elsewhere.
+        let inside: Vec<_> = entries(dir).collect();
+        let files = inside.iter().flat_map(entries);
+        let all = inside.iter().cloned().chain(files).chain([dir.clone()]);
+        reached.extend(all.filter_map(|path| Some((std::fs::canonicalize(path).ok()?, dir))));
+    }
+    let frames = captures.iter().flat_map(|capture| &capture.frames);
+    for file in frames.flat_map(|frame| [Some(&frame.image), frame.mask.as_ref()]).flatten() {
+        let whole = std::fs::canonicalize(file).unwrap_or_default();
+        if let Some(dir) = whole.ancestors().find_map(|path| reached.get(path)) {
+            return Err(Error::field(dir, "folder to write to", "one without pictures of the source", whole.display()));
+        }
+    }
+    Ok(())
+}
+
+/// Writes a capture into its [`folder`].
+pub fn write(capture: &Capture, format: Format, out: &Path, options: &WriteOptions) -> Result<Written> {
     let axes = options.axes.unwrap_or(format.axes());
     if axes != Axes::OpenCv && matches!(format, Format::Bop | Format::Colmap | Format::ColmapText) {
         let expected = format!("opencv, the axes of every {} file", format.name());
         return Err(Error::field(out, "convention", expected, axes.name()));
     }
+    let dir = folder(capture, format, out);
+    refuse_sources(std::slice::from_ref(capture), std::slice::from_ref(&dir))?;
     match format {
-        Format::Srn => srn::write(capture, out, axes, options),
-        Format::Transforms => transforms::write(capture, out, axes, options),
-        Format::Bop => bop::write(capture, out, capture.object_id.unwrap_or(number), options),
-        Format::Colmap => colmap::write(capture, out, true, options),
-        Format::ColmapText => colmap::write(capture, out, false, options),
+        Format::Srn => srn::write(capture, dir, axes, options),
+        Format::Transforms => transforms::write(capture, dir, axes, options),
+        Format::Bop => bop::write(capture, dir, options),
+        Format::Colmap => colmap::write(capture, dir, true, options),
+        Format::ColmapText => colmap::write(capture, dir, false, options),
     }
 }
 

@@ -5,9 +5,10 @@ use crate::camera::{Axes, Camera, unit_sphere_seen_from};
 use crate::capture::{Capture, Frame, FrameRecord};
 use crate::error::{Error, Result, read_text};
 use crate::picture::{Picture, cut};
+use crate::pixels::decode;
 use crate::srn::{InstanceFiles, InstanceWriter, Intrinsics, SrnSet, picture_size, read_pose_unchecked, write_png};
 use glam::DVec2;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Reads a set, or a single instance; one capture each.
 pub fn read(path: &Path, options: &ReadOptions) -> Result<Vec<Capture>> {
@@ -63,13 +64,15 @@ pub(crate) fn read_instance(files: &InstanceFiles, options: &ReadOptions) -> Res
             Err(error) => found.skip(error),
         }
     }
-    found.capture.record = FrameRecord::read(&files.dir)?;
+    if let Some(record) = FrameRecord::read(&files.dir)? {
+        (found.capture.object_id, found.capture.scene_id) = (record.object_id, record.scene_id);
+        found.capture.record = Some(record);
+    }
     Ok(found.capture)
 }
 
-/// Writes `out/<name>`: pinhole pictures on white. Intrinsics stand in one file, or beside each view where views differ.
-pub fn write(capture: &Capture, out: &Path, axes: Axes, options: &WriteOptions) -> Result<Written> {
-    let dir = out.join(&capture.name);
+/// Writes `dir`: pinhole pictures on white. Intrinsics stand in one file, or beside each view where views differ.
+pub(super) fn write(capture: &Capture, dir: PathBuf, axes: Axes, options: &WriteOptions) -> Result<Written> {
     let writer = InstanceWriter::bare(&dir, options.replace)?;
     let mut written = Written { dir: dir.clone(), ..Written::default() };
     let mut cameras = vec![];
@@ -123,6 +126,7 @@ fn write_picture(
     let extension = frame.image.extension().unwrap_or_default();
     let readable = ["png", "jpg", "jpeg"].iter().any(|known| extension.eq_ignore_ascii_case(known));
     if options.side.is_none() && frame.mask.is_none() && camera.is_pinhole() && readable {
+        decode(&frame.image)?;
         return super::copy_picture(frame, &folder, &frame.name, false).map(|_| Some(camera));
     }
     let mut picture = Picture::open(&frame.image, frame.mask.as_deref())?;

@@ -190,9 +190,8 @@ impl Lens {
     }
 }
 
-/// Writes `out/<name>/transforms.json` with `images/` and, where there are some, `masks/`.
-pub fn write(capture: &Capture, out: &Path, axes: Axes, options: &WriteOptions) -> Result<Written> {
-    let dir = out.join(&capture.name);
+/// Writes `dir/transforms.json` with `images/` and, where there are some, `masks/`.
+pub(super) fn write(capture: &Capture, dir: PathBuf, axes: Axes, options: &WriteOptions) -> Result<Written> {
     super::make_dir(&dir, options.replace)?;
     let lens: Vec<_> = capture.frames.iter().map(|frame| Camera { world_from_camera: DMat4::IDENTITY, ..frame.camera }).collect();
     let shared = lens.first().filter(|first| lens.iter().all(|camera| camera == *first)).map(Lens::of);
