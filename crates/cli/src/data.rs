@@ -1,6 +1,7 @@
 //! `sigma-data import`, `export` and `inspect`: posed pictures in and out, and a look at them.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -301,8 +302,17 @@ struct Estimate {
     image: PathBuf,
     instance: String,
     world_from_camera: [[f64; 4]; 4],
-    unexplained: f64,
+    /// Not known where the picture shows nothing.
+    unexplained: Option<f64>,
     seconds: f64,
+}
+
+impl Estimate {
+    /// The name of the instance's folder that the picture lies in.
+    fn folder(&self) -> Option<OsString> {
+        let image = std::fs::canonicalize(&self.image).unwrap_or_else(|_| self.image.clone());
+        image.ancestors().nth(2)?.file_name().map(OsString::from)
+    }
 }
 
 impl Export {
@@ -321,11 +331,10 @@ impl Export {
         let only = captures.len() == 1;
         for (capture, scene) in captures.iter_mut().zip(scenes) {
             let instance = capture.name.clone();
-            let of_view = |name: &str| {
-                // A model may call the only object otherwise.
-                let is_it = |e: &&Estimate| (only || e.instance == instance) && e.image.file_stem() == Some(name.as_ref());
-                estimates.iter().flatten().find(is_it)
-            };
+            // A model may call the only object otherwise; then its pictures say whose poses these are.
+            let is_of_it = |e: &&Estimate| e.instance == instance || only && e.folder().is_some_and(|name| *name == *instance);
+            let of_it: Vec<_> = estimates.iter().flatten().filter(is_of_it).collect();
+            let of_view = |name: &str| of_it.iter().find(|e| e.image.file_stem() == Some(name.as_ref()));
             let number = |frame: &Frame| frame.name.split('_').next()?.parse().ok();
             let numbers: Option<Vec<u32>> = capture.frames.iter().map(number).collect();
             let numbers = numbers.unwrap_or_else(|| (0..capture.frames.len() as u32).collect());
@@ -350,7 +359,7 @@ impl Export {
                     scene_id,
                     im_id,
                     obj_id,
-                    score: estimate.map_or(1.0, |estimate| 1.0 - estimate.unexplained),
+                    score: estimate.map_or(1.0, |estimate| estimate.unexplained.map_or(0.0, |part| 1.0 - part)),
                     camera_from_object: frame.camera.world_from_camera.inverse(),
                     time: estimate.map_or(-1.0, |estimate| estimate.seconds),
                 };
@@ -359,7 +368,10 @@ impl Export {
         }
         captures.retain(|capture| !capture.frames.is_empty());
         if captures.is_empty() {
-            return Err(format!("{}: no view of {} has a pose there", self.path.display(), show(self.poses.as_deref())).into());
+            let first = estimates.iter().flatten().next();
+            let found = first.map_or("none".into(), |e| format!("{} of {}", e.image.display(), e.instance));
+            let poses = self.poses.as_deref().unwrap_or(&self.path).display();
+            return Err(format!("{poses}: images: expected some of {}, found {found}", self.path.display()).into());
         }
         let Target::Format(format) = self.format else {
             refuse_to_write(&self.out, self.force)?;
@@ -389,10 +401,6 @@ impl Export {
         }
         Ok(true)
     }
-}
-
-fn show(path: Option<&Path>) -> String {
-    path.unwrap_or(Path::new("the source")).display().to_string()
 }
 
 fn read_estimates(path: &Path) -> Result<Vec<Estimate>> {

@@ -239,6 +239,24 @@ fn photographs_go_in_and_poses_come_out_as_they_came() {
     let csv = fs::read_to_string(dir.path().join("found.csv")).unwrap();
     assert!(csv.lines().nth(1).unwrap().starts_with("7,312,1,0.75,") && csv.trim_end().ends_with(",1.5"), "{csv}");
 
+    // Where nothing is seen, nothing can be unexplained; and poses of another object are not taken for this one's.
+    let mut estimate = estimate;
+    estimate["unexplained"] = serde_json::Value::Null;
+    let export = |estimate: &serde_json::Value| {
+        let file = dir.path().join("found.json");
+        fs::write(file, serde_json::json!({"convention": "opencv", "images": [estimate]}).to_string()).unwrap();
+        sigma_data(
+            &[&["export", &instance, "--format", "bop-results", "--out", &path("found.csv"), "--force"], &found[..]].concat(),
+        )
+    };
+    assert_eq!(export(&estimate).status.code(), Some(0));
+    assert!(fs::read_to_string(dir.path().join("found.csv")).unwrap().contains("\n1,312,1,0.0,"));
+    estimate["image"] = "set/another/rgb/0312.png".into();
+    let refused = stderr(&export(&estimate));
+    assert!(refused.contains("found.json: images: ") && refused.contains("another/rgb/0312.png of other"), "{refused}");
+    estimate["instance"] = "thing".into();
+    assert_eq!(export(&estimate).status.code(), Some(0));
+
     // The other formats, and a second import of what was written.
     for format in ["colmap", "colmap-text", "bop"] {
         let out = path(format);
