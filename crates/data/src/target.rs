@@ -82,6 +82,9 @@ impl Target {
         if points.count() == opacity.len() {
             return Self::of_view(path, None, intrinsics, side);
         }
+        // Where the object reaches the edge of the photograph, what lies beyond is not white but unknown.
+        let is_cut_off = [0, 1].into_iter().any(|k| low[k] == 0 || high[k] + 1 == size[k]);
+        let counts = counts.or_else(|| is_cut_off.then(|| vec![1.0; size[0] * size[1]]));
         let across = [0, 1].map(|k| high[k] - low[k] + 1);
         let extent = (across[0].max(across[1]) as f64 * (1.0 + 2.0 * MARGIN)).ceil() as usize;
         let corner = [0, 1].map(|k| (low[k] + high[k] + 1) as i64 / 2 - extent as i64 / 2);
@@ -191,6 +194,25 @@ mod tests {
         assert_eq!((both.corner, both.extent), ([39, 5], 8));
         // 7 of its 8 columns are in the mask; the last of the square's takes in the last one and a third.
         assert_eq!(both.weights.unwrap()[..6], [1.0, 1.0, 1.0, 1.0, 1.0, 0.25]);
+    }
+
+    /// Of an object that the edge of the photograph cuts off nobody knows how far it reaches.
+    #[test]
+    fn beyond_the_edge_that_an_object_reaches_nothing_counts() {
+        let dir = tempfile::tempdir().unwrap();
+        let cut = |from: u32, to: u32| {
+            let alpha = |x: u32, y: u32| if (from..to).contains(&x) && (10..20).contains(&y) { 255 } else { 0 };
+            let path = saved(dir.path(), "cut.png", RgbaImage::from_fn(60, 40, |x, y| Rgba([255, 0, 0, alpha(x, y)])));
+            Target::of_photo(&path, None, None, &INTRINSICS, 12).unwrap()
+        };
+        // 10 pixels and one on each side; the last column is one beyond the edge.
+        let target = cut(50, 60);
+        assert_eq!((target.corner, target.extent), ([49, 9], 12));
+        let expected: Vec<f32> = (0..144).map(|pixel| f32::from(pixel % 12 < 11)).collect();
+        assert_eq!(target.weights, Some(expected));
+        let coverage = target.coverage.unwrap();
+        assert_eq!((&coverage[..11], coverage[12], coverage[13], coverage[22]), (&[0.0; 11][..], 0.0, 1.0, 1.0));
+        assert_eq!(cut(49, 59).weights, None);
     }
 
     #[test]

@@ -3,10 +3,10 @@
 use std::borrow::Cow;
 use std::iter::zip;
 
-use glam::DMat4;
+use glam::{DMat4, DVec2};
 use serde::Serialize;
 
-use crate::align::Shown;
+use crate::align::{Shown, hidden_side};
 use crate::camera::{Intrinsics, Pose6};
 use crate::confidence::{motion, promise};
 use crate::descent::{Descent, Loss, Method, Shape};
@@ -364,7 +364,7 @@ pub fn estimate(
                 let best = own.min_by(|a, b| least(a).total_cmp(&least(b)));
                 let per_area = |h: &Hypothesis| h.loss / area(&queries[query], h.dilation);
                 let by = best.map(|tried| best_dilation(&tried.iter().map(per_area).collect::<Vec<_>>()));
-                *dilation = by.map(|by| queries[query].dilation + by).or(*dilation);
+                *dilation = by.map(|by| dilation.unwrap_or(queries[query].dilation) + by).or(*dilation);
             }
             let apart = |h: &&Hypothesis| (h.dilation - dilations[h.query].unwrap_or(0.0)).abs();
             let nearest = |tried: &[Hypothesis]| tried.iter().min_by(|a, b| apart(a).total_cmp(&apart(b))).copied();
@@ -497,15 +497,35 @@ fn align(
     views.compare()?;
     let renders = views.rgb()?;
     let values = 3 * targets.rays_per_image();
-    for (start, (rgb, render)) in zip(&mut starts, zip(targets.rgb.chunks(values), renders.chunks(values))) {
-        let query = &queries[start.query];
+    let hidden: Vec<Option<DVec2>> = queries.iter().map(hidden_side_of).collect();
+    // By number of the start: aligned as if nothing, and as if something of the object were hidden.
+    let mut either: Vec<(usize, [Pose6; 2])> = Vec::new();
+    for (k, (rgb, render)) in zip(targets.rgb.chunks(values), renders.chunks(values)).enumerate() {
+        let (query, start) = (&queries[running[k].query], running[k].pose.to_matrix());
         let weights = weights_of(query, phase.stride);
-        let shown = |rgb: &[f32]| Shown::of(rgb, &weights, rays_of(query, phase.stride));
-        if let (Some(wanted), Some(now)) = (shown(rgb), shown(render)) {
-            start.pose = Pose6::from_matrix(&wanted.seen_by(&now, &start.pose.to_matrix(), &query.intrinsics));
+        let shown = |rgb: &[f32], weights: &[f32]| Shown::of(rgb, weights, rays_of(query, phase.stride));
+        let aligned = |wanted: Shown, now: &Shown| Pose6::from_matrix(&wanted.seen_by(now, &start, &query.intrinsics));
+        let (Some(wanted), Some(in_sight)) = (shown(rgb, &weights), shown(render, &weights)) else { continue };
+        starts[k].pose = aligned(wanted, &in_sight);
+        if let (Some(side), Some(all)) = (hidden[running[k].query], shown(render, &vec![1.0; weights.len()])) {
+            either.push((k, [starts[k].pose, aligned(wanted.whole(&all, side), &all)]));
+        }
+    }
+    if !either.is_empty() {
+        let tried = either.iter().flat_map(|(k, poses)| poses.map(|pose| Hypothesis { pose, ..running[*k] }));
+        let tried: Vec<Hypothesis> = tried.collect();
+        let mut views = Targets::new(queries, options, phase, &tried).descent(engine, model, method, false, &tried)?;
+        views.compare()?;
+        for ((k, poses), losses) in zip(either, views.standing()?.chunks(2)) {
+            starts[k].pose = poses[usize::from(losses[1].0 < losses[0].0)];
         }
     }
     Ok(())
+}
+
+/// On which side something is before the object of an image, see [`hidden_side`].
+fn hidden_side_of(query: &Query) -> Option<DVec2> {
+    hidden_side(query.coverage.as_ref()?, query.weights.as_ref()?, query.width as usize)
 }
 
 /// Those that went through all phases, of queries that have not arrived, see [`Options::anew`]; and all others.
@@ -582,7 +602,7 @@ fn pixels_of(query: &Query, stride: u32) -> impl Iterator<Item = usize> {
 }
 
 /// Weights of the rays, scaled to a mean of 1: losses of pictures with masks and without are then of one kind.
-fn weights_of(query: &Query, stride: u32) -> Vec<f32> {
+pub(crate) fn weights_of(query: &Query, stride: u32) -> Vec<f32> {
     let weight = |pixel: usize| query.weights.as_ref().map_or(1.0, |weights| weights[pixel]);
     let weights: Vec<f32> = pixels_of(query, stride).map(weight).collect();
     let mean = weights.iter().sum::<f32>() / weights.len() as f32;
