@@ -410,7 +410,8 @@ impl Bench<'_> {
         const IMAGES: u32 = 10;
         let mut trainer = Trainer::new(self.engine, self.model.clone(), Train::Everything, IMAGES, RAYS)?;
         let instances = (0..IMAGES).map(|image| image % 9).collect();
-        let batch = TrainingBatch { instances, rays: rays(IMAGES, SIDE, RAYS), target_rgb: target(3 * IMAGES * RAYS) };
+        let batch =
+            TrainingBatch { instances, rays: rays(IMAGES, SIDE, RAYS), target_rgb: target(3 * IMAGES * RAYS), weights: None };
         let plan = trainer.executor().plan();
         let flops = plan.stages.iter().flat_map(|stage| &stage.steps).map(|step| step.flops).sum();
         let bytes = plan.bytes();

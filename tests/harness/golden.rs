@@ -111,6 +111,7 @@ impl Golden {
                 z0: self.get("in.initial_depth")?.to_vec(),
             },
             target_rgb: self.get("in.target_rgb")?.to_vec(),
+            weights: None,
         })
     }
 

@@ -38,7 +38,7 @@ fn picture(instance: u32, world_from_camera: &glam::DMat4) -> Vec<f32> {
 fn batch(step: u64) -> TrainingBatch {
     let mut random = stream(11, step);
     let cameras = camera::fixed24(1.3);
-    let mut batch = TrainingBatch { instances: vec![], rays: Rays::default(), target_rgb: vec![] };
+    let mut batch = TrainingBatch { instances: vec![], rays: Rays::default(), target_rgb: vec![], weights: None };
     for image in 0..IMAGES {
         let (instance, camera) = (image % 2, &cameras[(step * 7 + u64::from(image) * 5) as usize % 24]);
         batch.instances.push(instance);
@@ -406,6 +406,30 @@ fn an_object_is_found_without_its_name() {
         assert!(ranking.is_sorted_by(|a, b| a.loss <= b.loss) && ranking[0].loss == found.estimate.loss, "{ranking:?}");
         assert_eq!((turns[0], turns.last()), ((0, turns.len()), Some(&(turns.len() - 1, turns.len()))));
     }
+}
+
+/// Where pixels do not count there may be anything, also for the code that is fitted to the picture.
+#[test]
+fn the_code_of_an_unknown_object_does_not_see_what_does_not_count() {
+    let engine = Engine::cpu();
+    let mut trainer = trainer(&engine);
+    train(&mut trainer, 100);
+    let truth = camera::fixed24(1.3)[1];
+    let weights: Vec<f32> = (0..SIDE * SIDE).map(|pixel| f32::from(pixel % SIDE >= SIDE / 3)).collect();
+    let found = |behind: f32| {
+        let mut rgb = picture(1, &truth);
+        for (pixel, _) in weights.iter().enumerate().filter(|(_, weight)| **weight == 0.0) {
+            rgb[3 * pixel..][..3].fill(behind);
+        }
+        let (weights, starts) = (Some(weights.clone()), vec![truth]);
+        let [width, height] = [SIDE; 2];
+        let query =
+            Query { instance: 0, rgb, weights, coverage: None, dilation: 0.0, width, height, intrinsics: intrinsics(), starts };
+        let found = estimate_unseen(&engine, trainer.model().unwrap(), &query, 0, |_, _| Ok(())).unwrap();
+        (found.estimate.pose, found.estimate.loss, found.model)
+    };
+    let of = [-1.0, 0.3].map(found);
+    assert_eq!(of[0], of[1]);
 }
 
 /// The second derivatives of an estimate are those at its pose, not what the way there has left of them: deviations must not depend on

@@ -53,7 +53,7 @@ fn batch(images: u32) -> TrainingBatch {
     let value = |k: u32| if k.is_multiple_of(2) { 1.0 } else { (k * 7919 % 200) as f32 / 100.0 - 1.0 };
     // Instance 0 does not appear, the last one more than once.
     let instances = (0..images).map(|k| (k + 1).min(INSTANCES - 1)).collect();
-    TrainingBatch { instances, rays, target_rgb: (0..images * RAYS * 3).map(value).collect() }
+    TrainingBatch { instances, rays, target_rgb: (0..images * RAYS * 3).map(value).collect(), weights: None }
 }
 
 fn trainer(engine: &Engine, model: Model, train: Train, images: u32) -> Trainer {

@@ -160,6 +160,8 @@ pub struct Metadata {
     pub calibration_of_new: Option<Calibration>,
 }
 
+/// Marching steps of a file, at most: what a renderer allocates grows with them.
+const MOST_STEPS: f64 = 1000.0;
 /// How much nearer, or farther, than all training cameras a camera may be for the model to know what it sees.
 const BEYOND: f64 = 1.1;
 /// The same beside the one distance that is known of all of them.
@@ -391,6 +393,13 @@ fn collect(shapes: &dyn Shapes, tracing_steps: u32) -> Result<(Layout, Vec<Param
     let has_density = shapes.shape("sigma.net.0.net.0.weight").or_else(|| shapes.shape("sigma.net.0.weight")).is_some();
     let density = has_density.then(|| collector.mlp(Kind::Linear, "sigma.net", SCENE_INPUT)).transpose()?;
     let pixel_generator = collector.mlp(Kind::Linear, "pixel_generator.net", width)?;
+    for (layers, outputs) in density.iter().map(|layers| (layers, 1)).chain([(&pixel_generator, 3)]) {
+        if let Some(last) = layers.last().filter(|last| last.out_features != outputs) {
+            let (name, shape) = &collector.parameters[last.linear].tensors[0];
+            let expected = format!("[{outputs}, {}]", last.in_features);
+            return Err(Error::Tensor { name: name.clone(), expected, got: format!("{shape:?}") });
+        }
+    }
     let layout = Layout { instances, tracing_steps, source, scene, lstm_input, lstm_hidden, step_head, density, pixel_generator };
     Ok((layout, collector.parameters))
 }
@@ -441,8 +450,9 @@ impl Model {
         }
         let number = |key: &str| text.get(key).map(|value| value.parse::<f64>());
         let tracing_steps = match number("tracing_steps") {
-            Some(Ok(steps)) if steps >= 1.0 && steps.fract() == 0.0 => steps as u32,
-            _ => return Err(format("metadata `tracing_steps` must be a whole number of at least 1".into())),
+            Some(Ok(steps)) if (1.0..=MOST_STEPS).contains(&steps) && steps.fract() == 0.0 => steps as u32,
+            Some(_) => return Err(format(format!("metadata `tracing_steps` must be a whole number from 1 to {MOST_STEPS}"))),
+            None => return Err(format("it is no model of this program: it has no metadata `tracing_steps`".into())),
         };
         let json = |key: &str| text.get(key).map_or("null", String::as_str);
         let wrong = |key: &str, error: serde_json::Error| format(format!("metadata `{key}`: {error}"));
@@ -589,11 +599,9 @@ impl Model {
         text
     }
 
-    /// Number of the instance called `name`, or with the number `name`.
+    /// Number of the instance with this [`Model::instance_name`].
     pub fn instance(&self, name: &str) -> Result<u32, Error> {
-        let by_name = self.metadata.instance_names.iter().position(|known| known == name);
-        let by_number = || name.parse().ok().filter(|&number: &usize| number < self.layout.instances as usize);
-        by_name.or_else(by_number).map(|number| number as u32).ok_or_else(|| Error::Input {
+        (0..self.layout.instances).find(|&number| self.instance_name(number) == name).ok_or_else(|| Error::Input {
             input: format!("instance `{name}`"),
             what: format!("the model knows {}", self.known_instances()),
         })

@@ -102,7 +102,8 @@ impl Tracker {
             (_, None) => vec![phase(5, 2, 1), Phase { dilate: true, ..phase(5, 2, 1) }, phase(3, 1, 1)],
         };
         let (first, _) = self.search.tries()?;
-        let options = Options { phases, min_starts: 0, align: false, ..first.clone() };
+        // Steps so few are those of BFGS, also after a first search the paper's way.
+        let options = Options { phases, min_starts: 0, align: false, seed: first.seed, ..Options::default() };
         Ok(Search { tries: vec![options], accept: self.search.accept })
     }
 }

@@ -47,6 +47,8 @@ pub struct TrainingBatch {
     pub rays: Rays,
     /// Colours in [-1, 1], `[images, rays, 3]`.
     pub target_rgb: Vec<f32>,
+    /// How much each ray counts `[images, rays]`, with a mean of 1; `None`: all the same.
+    pub weights: Option<Vec<f32>>,
 }
 
 impl TrainingBatch {
@@ -59,7 +61,7 @@ impl TrainingBatch {
         let camera = fixed24(model.metadata.orbit_radius.unwrap_or(1.3))[7 * number as usize];
         rays.push(&camera, &intrinsics, pixel_grid(proof::SIDE, proof::SIDE, 1), &mut random);
         let target_rgb = (0..3 * rays.z0.len()).map(|_| random.random_range(-1.0..1.0)).collect();
-        TrainingBatch { instances: vec![number % model.layout.instances], rays, target_rgb }
+        TrainingBatch { instances: vec![number % model.layout.instances], rays, target_rgb, weights: None }
     }
 }
 
@@ -198,10 +200,14 @@ impl Trainer {
             let what = format!("{} images, this trainer takes {images}", batch.instances.len());
             return Err(Error::Input { input: "batch".into(), what });
         }
+        if let Some(weights) = batch.weights.as_ref().filter(|weights| 3 * weights.len() != batch.target_rgb.len()) {
+            let what = format!("{} weights for {} values of colour", weights.len(), batch.target_rgb.len());
+            return Err(Error::Input { input: "batch".into(), what });
+        }
         self.runner.write_u32(network.index, &batch.instances)?;
         self.runner.write_f64(network.world_from_camera, batch.rays.world_from_camera.as_flattened())?;
         batch.rays.write(&mut *self.runner, network)?;
-        self.runner.write(self.handles.target, &wanted(&batch.target_rgb, None))?;
+        self.runner.write(self.handles.target, &wanted(&batch.target_rgb, batch.weights.as_deref()))?;
         let Handles { streamed, before, render, after, .. } = &mut self.handles;
         self.runner.run(*before)?;
         if let Some(streamed) = streamed {
@@ -314,6 +320,11 @@ impl Trainer {
             let [m, v] = moment_names(&model, number).map(|name| stored(name, model.parameters[number].values.len()));
             Ok::<_, Error>([m?, v?])
         };
+        // What is wrong with any of them is known before the first is overwritten.
+        let streamed = self.handles.streamed.iter_mut().flat_map(Streamed::moments_mut).map(|(number, _)| number);
+        for number in self.handles.moments.iter().map(|&(number, _)| number).chain(streamed) {
+            stored(number)?;
+        }
         for &(number, buffers) in &self.handles.moments {
             for (buffer, values) in buffers.into_iter().zip(stored(number)?) {
                 self.runner.write(buffer, values)?;

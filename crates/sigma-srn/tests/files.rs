@@ -33,6 +33,44 @@ fn fuzz_model() {
     });
 }
 
+/// What a renderer would take for colours, or allocate without end.
+#[test]
+fn outputs_and_marching_steps_are_checked() {
+    use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("model.safetensors");
+    let config = ModelConfig { hidden: 8, latent: 4, instances: 2, tracing_steps: 2, density: true };
+    Model::init(&config, 1).unwrap().save(&path).unwrap();
+    let good = std::fs::read(&path).unwrap();
+    let (_, header) = SafeTensors::read_metadata(&good).unwrap();
+    let metadata = header.metadata().clone().unwrap();
+    let zeros = vec![0; 4096];
+    let error = |longer: &str, steps: &str| {
+        let view = |(name, view): (String, TensorView)| {
+            let mut shape = view.shape().to_vec();
+            shape[0] += usize::from(name.starts_with(longer));
+            let bytes = &zeros[..4 * shape.iter().product::<usize>()];
+            (name, TensorView::new(Dtype::F32, shape, bytes).unwrap())
+        };
+        let file = SafeTensors::deserialize(&good).unwrap();
+        let tensors: Vec<_> = file.tensors().into_iter().map(|(name, tensor)| view((name.to_string(), tensor))).collect();
+        let mut metadata = metadata.clone();
+        metadata.insert("tracing_steps".into(), steps.into());
+        let bytes = serialize(tensors.iter().map(|(name, view)| (name.as_str(), view)), Some(metadata)).unwrap();
+        Model::from_bytes(&bytes, "", Path::new("model.safetensors")).map(|_| ()).map_err(|error| error.to_string())
+    };
+    assert_eq!(error("none", "2"), Ok(()));
+    let names: Vec<String> = Model::load(&path).unwrap().tensors().into_iter().map(|(name, ..)| name).collect();
+    for (network, outputs) in [("sigma.net.", "[1, 8]"), ("pixel_generator.net.", "[3, 8]")] {
+        let last = names.iter().filter(|name| name.starts_with(network)).max().unwrap();
+        let layer = last.rsplit_once('.').unwrap().0;
+        let error = error(layer, "2").unwrap_err();
+        assert!(error.contains(layer) && error.contains(outputs), "{error}");
+    }
+    let error = error("none", "4294967295").unwrap_err();
+    assert!(error.contains("tracing_steps") && error.contains("1000"), "{error}");
+}
+
 #[test]
 fn a_model_knows_how_far_away_its_cameras_were() {
     let known = |metadata: Metadata| [0.5, 0.99, 1.01, 1.6, 1.7].map(|distance| metadata.knows_distance(distance));

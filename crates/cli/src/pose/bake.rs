@@ -12,7 +12,7 @@ pub struct Bake {
     /// Model, or checkpoint of a training run.
     #[arg(long, value_name = "FILE")]
     model: PathBuf,
-    /// Name or number of the object; of several, once for each.
+    /// Name of the object, or its number where the model has no names; of several, once for each.
     #[arg(long, value_name = "NAME", required = true)]
     instance: Vec<String>,
     /// The model to write: these objects alone.

@@ -232,11 +232,11 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
     let truths = poses("--truth", &args.truth, &args.images, notation)?;
     let cutouts = each("--cutout", "masks", &args.cutout, &args.images)?;
     let masks = each("--mask", "masks", &args.mask, &args.images)?;
-    let mut names = HashSet::new();
-    let mut pictures = Vec::new();
+    // Of an object that the model does not know the number says nothing.
+    let (any, mut names, mut pictures) = (model.instance_name(0), HashSet::new(), Vec::new());
     for (((path, cutout), (_, mask)), truth) in cutouts.into_iter().zip(masks).zip(truths) {
         let masks = Masks { cutout: cutout.map(PathBuf::as_path), mask: mask.map(PathBuf::as_path) };
-        let instance = if args.unseen { Some("0") } else { args.object.instance.as_deref() };
+        let instance = if args.unseen { Some(any.as_str()) } else { args.object.instance.as_deref() };
         let picture = Picture::open(path, masks, model, side, instance, &args.object.camera)?;
         let mut picture = Picture { truth, ..picture };
         while !names.insert(picture.name.clone()) {
@@ -306,19 +306,19 @@ impl Report {
         if args.json {
             return print(&serde_json::to_string_pretty(self)?);
         }
-        let poses = found.iter().map(|found| Pose6::from_matrix(&notation.written(&found.world_from_camera)));
-        self.images.iter().zip(poses).try_for_each(|(image, pose)| print(&image.line(&pose)))
+        self.images.iter().zip(found).try_for_each(|(image, found)| print(&image.line(found, notation)))
     }
 }
 
 impl ImageReport {
     /// What is printed without `--json`, the pose as it was asked for.
-    fn line(&self, pose: &Pose6) -> String {
-        let [a, b, c, x, y, z] = pose.0;
+    fn line(&self, found: &Found, notation: &Notation) -> String {
+        let [a, b, c, x, y, z] = Pose6::from_matrix(&notation.written(&found.world_from_camera)).0;
         let [a, b, c] = [a, b, c].map(f64::to_degrees);
         let verdict = self.doubt.map_or(String::new(), |doubt| format!("  DO NOT TRUST: {doubt}"));
-        let deviation = self.confidence.map_or(String::new(), |c| format!("  ± {:.2}° {:.4}", c.rotation_deg, c.translation));
-        let error = self.error.map_or(String::new(), |error| format!("  error {error}"));
+        let confidence = self.confidence.map(|confidence| notation.confidence(confidence));
+        let deviation = confidence.map_or(String::new(), |c| format!("  ± {:.2}° {:.4}", c.rotation_deg, c.translation));
+        let error = self.error.map_or(String::new(), |error| format!("  error {}", notation.error(error)));
         format!(
             "{}  {}  rotation {a:.2}° {b:.2}° {c:.2}°  centre {x:.4} {y:.4} {z:.4}{deviation}  loss {:.4}  unexplained {:.0} %  \
              start {} of {}  {:.1} s{error}{verdict}",

@@ -27,7 +27,7 @@ pub struct ObjectArgs {
     /// Model, or checkpoint of a training run.
     #[arg(long, value_name = "FILE")]
     pub model: PathBuf,
-    /// Name or number of the object in the pictures. Default: the name of the SRN folder that a picture lies in, else the model's
+    /// Name of the object in the pictures, or its number where the model has no names. Default: the name of the SRN folder that a picture lies in, else the model's
     /// only one.
     #[arg(long, value_name = "NAME")]
     pub instance: Option<String>,

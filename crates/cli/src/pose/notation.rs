@@ -4,9 +4,11 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use glam::DMat4;
+use sigma_srn::Confidence;
 use srn_data::camera::Axes;
 use srn_data::capture::{FrameRecord, moved};
 
+use super::search::PoseError;
 use crate::common::{Result, axes};
 
 /// Flags that say how poses are given and printed. Those inside of data sets are as data sets are: OpenCV's axes, the object's frame.
@@ -71,6 +73,18 @@ impl Notation {
         1.0 / self.world_from_source.x_axis.truncate().length()
     }
 
+    /// A deviation, from object units.
+    pub fn confidence(&self, of: Confidence) -> Confidence {
+        let unit = |k: usize| if k < 3 { 1.0 } else { self.unit() };
+        let covariance = std::array::from_fn(|i| std::array::from_fn(|k| unit(i) * unit(k) * of.covariance[i][k]));
+        Confidence { translation: self.unit() * of.translation, covariance, ..of }
+    }
+
+    /// An error, from object units.
+    pub fn error(&self, of: PoseError) -> PoseError {
+        PoseError { translation: self.unit() * of.translation, ..of }
+    }
+
     /// The matrix as rows.
     pub fn rows(&self, world_from_camera: &DMat4) -> [[f64; 4]; 4] {
         self.written(world_from_camera).transpose().to_cols_array_2d()
@@ -96,6 +110,12 @@ mod tests {
             assert!(written.w_axis.truncate().abs_diff_eq(source_from_world.transform_point3(pose.w_axis.truncate()), 1e-9));
             assert!((notation.unit() - 250.0).abs() < 1e-9 && (written.determinant() - 1.0).abs() < 1e-12);
         }
+        let notation = Notation { axes: Axes::OpenCv, world_from_source: source_from_world.inverse() };
+        let covariance = std::array::from_fn(|i| std::array::from_fn(|k| f64::from(u8::from(i == k))));
+        let written = notation.confidence(Confidence { rotation_deg: 1.0, translation: 0.02, covariance });
+        assert!(written.rotation_deg == 1.0 && (written.translation - 5.0).abs() < 1e-9);
+        let apart = |k: usize, variance: f64| (written.covariance[k][k] / variance - 1.0).abs();
+        assert!(apart(2, 1.0) < 1e-9 && apart(3, 62_500.0) < 1e-9, "{:?}", written.covariance);
         let plain = Notation { axes: Axes::OpenGl, world_from_source: DMat4::IDENTITY };
         assert_eq!(plain.written(&look_at_origin(2.0 * DVec3::X)).z_axis, DVec4::X);
     }

@@ -77,8 +77,8 @@ impl Log {
         let renders = render(on, &views)?;
         let page = Page { log: self, index, picture, found, side: on.side, path: &path, chosen: &chosen };
         let rgb: Vec<&[f32]> = renders.iter().map(|render| &render.rgb[..]).collect();
-        write_png(&dir.join(&picture.name).with_extension("png"), &page.sheet(&rgb))?;
-        write_gif(&dir.join(&picture.name).with_extension("gif"), page.animation(&rgb))
+        write_png(&dir.join(format!("{}.png", picture.name)), &page.sheet(&rgb))?;
+        write_gif(&dir.join(format!("{}.gif", picture.name)), page.animation(&rgb))
     }
 }
 

@@ -28,7 +28,7 @@ pub struct Render {
     /// Model, or checkpoint of a training run.
     #[arg(long, value_name = "FILE")]
     model: PathBuf,
-    /// Name or number of the object. Default: the model's only one.
+    /// Name of the object, or its number where the model has no names. Default: the model's only one.
     #[arg(long, value_name = "NAME")]
     instance: Option<String>,
     /// Picture (.png), animation (.gif), or folder: an SRN instance with pictures, poses and intrinsics.

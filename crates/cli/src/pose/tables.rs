@@ -240,32 +240,46 @@ impl Bench<'_> {
             one_shot(on, asked, &search, &setting.starts)?
         } else {
             // Each search begins when the one before has ended: before its first evaluation.
-            let mut last = Instant::now();
-            let (mut running, mut began, mut number) = (0, last, 0);
-            views::search(asked, on, &search, &setting.starts, &notation, |i, progress| {
+            let (mut last, mut began) = (Instant::now(), Instant::now());
+            // Of each instance's search: how many moments it has had, and errors and seconds at the last of them.
+            let mut ways: Vec<_> = asked.iter().map(|views| (0, vec![f64::NAN; views.truths.len()], 0.0)).collect();
+            let found = views::search(asked, on, &search, &setting.starts, &notation, |i, progress| {
                 // The figure is one of single searches.
                 if progress.search > 0 {
                     last = Instant::now();
                     return Ok(());
                 }
-                if i != running {
-                    (running, began, number) = (i, last, 0);
+                let (number, errors, seconds) = &mut ways[i];
+                if *number == 0 {
+                    began = last;
                 }
                 let standing = progress.descent.standing()?;
-                if moments.len() == number {
+                if moments.len() == *number {
                     moments.push(Moment { step: progress.step, ..Moment::default() });
                 }
-                for (query, truth) in asked[i].truths.iter().enumerate() {
+                for (query, (truth, error)) in asked[i].truths.iter().zip(&mut *errors).enumerate() {
                     let own = standing.iter().zip(progress.hypotheses).filter(|(_, name)| name.0 == query);
-                    let best = own.min_by(|(a, _), (b, _)| a.0.total_cmp(&b.0)).expect("every query has a hypothesis");
-                    let pose = best.0.1.to_matrix();
-                    moments[number].errors.push(PoseError::of(&pose, &symmetries[i].nearest(truth, &pose)).rotation_deg);
+                    // None where the last phase begins anew for others.
+                    if let Some(((_, pose), _)) = own.min_by(|(a, _), (b, _)| a.0.total_cmp(&b.0)) {
+                        let pose = pose.to_matrix();
+                        *error = PoseError::of(&pose, &symmetries[i].nearest(truth, &pose)).rotation_deg;
+                    }
                 }
                 last = Instant::now();
-                moments[number].seconds += last.duration_since(began).as_secs_f64();
-                number += 1;
+                *seconds = last.duration_since(began).as_secs_f64();
+                moments[*number].errors.extend(&*errors);
+                moments[*number].seconds += *seconds;
+                *number += 1;
                 Ok(())
-            })?
+            })?;
+            // Whose search has ended stays where it is.
+            for (number, errors, seconds) in &ways {
+                for moment in &mut moments[*number..] {
+                    moment.errors.extend(errors);
+                    moment.seconds += seconds;
+                }
+            }
+            found
         };
         let mut results = Vec::new();
         for ((Views { name, pictures, truths, .. }, symmetries), found) in asked.iter().zip(&symmetries).zip(found) {

@@ -21,7 +21,8 @@ const STAY: f64 = 0.1;
 #[derive(Args, Debug)]
 pub struct Track {
     /// Frames in order, as `estimate` takes them; or a folder, whose pictures are taken by name; or `-`: their paths come on stdin, one per
-    /// line, and each is answered before the next is read.
+    /// line, and each is answered before the next is read. One after the first that is no picture, or has nothing of the object, is said to be so, and
+    /// the next is taken.
     #[arg(required = true, value_name = "FRAME|DIR|-")]
     frames: Vec<PathBuf>,
     #[command(flatten)]
@@ -94,7 +95,23 @@ pub fn run(args: &Track) -> Result<bool> {
     for path in std::iter::once(Ok(first)).chain(frames) {
         let path = path?;
         let masks = Masks { cutout: args.cutout.as_deref(), mask: args.mask.as_deref() };
-        let picture = Picture::open(&path, masks, &model, side, args.object.instance.as_deref(), &args.object.camera)?;
+        let picture = Picture::open(&path, masks, &model, side, args.object.instance.as_deref(), &args.object.camera);
+        let picture = match picture {
+            Ok(picture) => picture,
+            // The first says whether the flags are right; later ones come from a camera that may have lost the object.
+            Err(failure) if tracker.is_some() => {
+                trusted = false;
+                count += 1;
+                let (frame, failure) = (&path, failure.to_string());
+                print(&if args.json {
+                    serde_json::json!({ "frame": frame, "trusted": trusted, "failure": failure }).to_string()
+                } else {
+                    format!("{}  DO NOT TRUST: {failure}", frame.display())
+                })?;
+                continue;
+            }
+            Err(error) => return Err(error),
+        };
         let starts = args.search.starts(&Starts::Around84, &model, &picture, side, None, &notation)?;
         let tracker = match &mut tracker {
             Some(tracker) => tracker,
@@ -113,7 +130,7 @@ pub fn run(args: &Track) -> Result<bool> {
         let known = tracker.rim().map(|rim| rim * picture.intrinsics.fx);
         let dilation = found.estimate.dilation.or(known).map(|by| by * frame_pixels);
         let truth = args.truth.as_ref().map(|truth| truth.read(&path, &notation)).transpose()?;
-        let error = truth.map(|truth| PoseError::of(&found.world_from_camera, &truth));
+        let error = truth.map(|truth| notation.error(PoseError::of(&found.world_from_camera, &truth)));
         errors.extend(error);
         searches += usize::from(searched);
         if let Some(path) = &args.record {
@@ -131,7 +148,7 @@ pub fn run(args: &Track) -> Result<bool> {
             unexplained: found.unexplained,
             trusted,
             doubt: found.doubt,
-            confidence: found.confidence,
+            confidence: found.confidence.map(|confidence| notation.confidence(confidence)),
             searched,
             mask_dilation_px: dilation,
             error,

@@ -25,7 +25,7 @@ const DETAIL_CONTRAST: f32 = 0.03;
 /// The images of a training step: `rays` random pixels of each view, without repetition, or all of them in order. The part
 /// `detail` of them is drawn where the picture is not of one colour, as far as there are such pixels.
 fn training_batch(views: &[Shown], side: u32, rays: u32, detail: f64, random: &mut Random) -> TrainingBatch {
-    let mut batch = TrainingBatch { instances: vec![], rays: Rays::default(), target_rgb: vec![] };
+    let mut batch = TrainingBatch { instances: vec![], rays: Rays::default(), target_rgb: vec![], weights: None };
     for &(instance, view) in views {
         let pixels: Vec<(u32, u32)> = if rays == side * side {
             pixel_grid(side, side, 1).collect()
