@@ -164,15 +164,19 @@ pub fn refuse_existing(paths: impl IntoIterator<Item = PathBuf>, force: bool) ->
     }
 }
 
-/// Fails if a file is there already, or has no folder to be in: found out now rather than after the work.
+/// Fails if a file is there already, or has no folder to be in that can be written to: found out now rather than after the work.
 pub fn refuse_to_write(path: &Path, force: bool) -> Result<()> {
     refuse_existing([path.to_owned()], force)?;
-    match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() && !folder.is_dir() => {
-            Err(format!("{}: its folder does not exist", path.display()).into())
-        }
-        _ => Ok(()),
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if !folder.is_dir() {
+        return Err(format!("{}: its folder does not exist", path.display()).into());
     }
+    // Permissions say little of who may write where; a file does.
+    let probe = folder.join(format!(".sigma-srn-{}", std::process::id()));
+    std::fs::File::create(&probe)
+        .and_then(|_| std::fs::remove_file(&probe))
+        .map_err(|error| format!("{}: {error}", path.display()))?;
+    Ok(())
 }
 
 /// Prints a result on stdout; a full disk or a closed pipe is an error, not a panic.

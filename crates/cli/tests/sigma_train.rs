@@ -257,6 +257,7 @@ fn bad_calls_end_with_2_and_one_line() {
         (format!("adapt --model {used}/thesis.tex --data {TEST} --out {at_m}", at_m = at("m")), &["thesis.tex"]),
         (format!("adapt --model {used}/thesis.tex --data {TEST} --out {used}/thesis.tex"), &["exists already"]),
         (format!("adapt --model {used}/thesis.tex --data {TEST} --out {run}/m"), &["folder does not exist"]),
+        (format!("adapt --model {used}/thesis.tex --data {TEST} --out /proc/m"), &["/proc/m"]),
     ] {
         fail(&args, words);
         assert!(!Path::new(&run).exists(), "{args}");

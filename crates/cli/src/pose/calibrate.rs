@@ -28,6 +28,8 @@ const FAR_DEG: f64 = 90.0;
 /// What a search that was made to fail counts beside one that was not: about one pose in five is then wrong, more than in earnest, for
 /// trusting a wrong pose is worse than doubting a right one.
 const LOST_WEIGHT: f64 = 0.25;
+/// Searches of which 95 % are not all: with fewer the largest error of them says where the others end.
+const ENOUGH: usize = 19;
 /// Values of each limit that are tried, at most.
 const CANDIDATES: usize = 64;
 
@@ -280,6 +282,10 @@ impl Searches {
 
     /// What they tell of others.
     fn calibration(&self, at_truth: BTreeMap<String, f64>) -> Result<Calibration> {
+        let found = self.known.iter().filter(|known| !known.has_failed).count();
+        if found < ENOUGH {
+            eprintln!("warning: {found} poses were found: too few to say where 95 % of errors end, which takes {ENOUGH} or more");
+        }
         Ok(calibration(&self.known, &self.lost, at_truth).ok_or("no search came near enough to the truth to learn from")?)
     }
 }

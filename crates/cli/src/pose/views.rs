@@ -31,8 +31,8 @@ pub fn open(model: &Model, data: &Path, instances: u32, views: u32) -> Result<(u
     let found = known.len();
     known.retain(|files| model.instance(&files.name).is_ok());
     if known.is_empty() {
-        let names = model.metadata.instance_names.join(", ");
-        return Err(format!("{}: none of its {found} instances is in the model, which knows {names}", data.display()).into());
+        let known = model.known_instances();
+        return Err(format!("{}: none of its {found} instances is in the model, which knows {known}", data.display()).into());
     }
     if known.len() < found {
         eprintln!("{} of {found} instances are not in the model and are left out", found - known.len());

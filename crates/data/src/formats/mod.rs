@@ -150,7 +150,7 @@ pub struct Written {
     pub warnings: Vec<String>,
 }
 
-/// The folder that [`write`] makes for a capture: `out/<name>`; for BOP `out/<scene>`, where the capture has no number of a scene
+/// The folder that [`write()`] makes for a capture: `out/<name>`; for BOP `out/<scene>`, where the capture has no number of a scene
 /// that of its object, as BOP names the training pictures of an object.
 pub fn folder(capture: &Capture, format: Format, out: &Path) -> PathBuf {
     match format {
