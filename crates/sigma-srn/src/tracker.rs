@@ -103,7 +103,8 @@ impl Tracker {
         };
         let (first, _) = self.search.tries()?;
         // Steps so few are those of BFGS, also after a first search the paper's way.
-        let options = Options { phases, min_starts: 0, align: false, seed: first.seed, ..Options::default() };
+        let Options { method, .. } = Options::default();
+        let options = Options { method, phases, min_starts: 0, align: false, ..first.clone() };
         Ok(Search { tries: vec![options], accept: self.search.accept })
     }
 }
