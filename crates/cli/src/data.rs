@@ -11,6 +11,7 @@ use srn_data::camera::Axes;
 use srn_data::capture::{Bounds, Capture, Frame, FrameRecord, UpAxis};
 use srn_data::formats::{self, Format, ReadOptions, WriteOptions, Written, bop};
 use srn_data::inspect::{self, Origin};
+use srn_data::srn;
 use srn_data::target::MARGIN;
 
 use crate::common::{Result, axes, named, progress, refuse_existing, refuse_to_write};
@@ -162,6 +163,14 @@ impl Import {
             margin: self.margin,
             replace: self.force,
         };
+        for Capture { name, frames, .. } in &captures {
+            let turned = frames.iter().filter(|frame| srn::is_turned(&frame.image)).count();
+            if turned > 0 {
+                eprintln!(
+                    "warning: {name}: by their EXIF {turned} pictures are to be turned; pixels are taken as they are stored"
+                );
+            }
+        }
         let folders = if self.hold_out.is_some() { &["train", "test"][..] } else { &[""] };
         let outs = folders.iter().map(|folder| self.out.join(folder));
         let dirs = outs.flat_map(|out| captures.iter().map(move |capture| formats::folder(capture, Format::Srn, &out)));

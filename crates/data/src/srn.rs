@@ -10,7 +10,8 @@ use crate::camera::rigid_error;
 use crate::error::{At, Error, Result, read_text};
 use crate::pixels::Pixels;
 use glam::DMat4;
-use image::RgbImage;
+use image::metadata::Orientation;
+use image::{ImageDecoder, RgbImage};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -188,6 +189,13 @@ pub fn picture_size(path: &Path) -> Result<[usize; 2]> {
     let reader = image::ImageReader::open(path).at(path)?.with_guessed_format().at(path)?;
     let (width, height) = reader.into_dimensions().at(path)?;
     Ok([width as usize, height as usize])
+}
+
+/// Whether a picture has a note (EXIF) that it is to be turned, which nothing here does; not so where it cannot be read.
+pub fn is_turned(path: &Path) -> bool {
+    let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format).ok();
+    let orientation = reader.and_then(|reader| reader.into_decoder().ok()?.orientation().ok());
+    orientation.is_some_and(|orientation| orientation != Orientation::NoTransforms)
 }
 
 /// Reads one picture as a square of `side` pixels, and the `[fx, fy, cx, cy]` that belong to it: the crop shifts the principal
@@ -548,6 +556,26 @@ mod tests {
         broken("intrinsics.txt", text("50 4 4\n0 0 0\n1\n"), &["height width"]);
         broken("intrinsics.txt", text("-50 4 4\n0 0 0\n1\n8 8"), &["positive", "-50"]);
         broken("intrinsics.txt", text("50 4 4\n0 0 0\n1\n8 0"), &["positive"]);
+    }
+
+    #[test]
+    fn a_note_that_a_picture_is_turned_is_seen() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("photo.jpg");
+        RgbImage::new(8, 4).save(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        // One entry, the orientation, in little-endian TIFF.
+        let exif = |orientation: u8| {
+            [b"\xff\xe1\0\x22Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0", &[orientation, 0, 0, 0, 0, 0, 0, 0][..]]
+                .concat()
+        };
+        let noted = |orientation| {
+            write(&path, [&whole[..2], &exif(orientation), &whole[2..]].concat()).unwrap();
+            is_turned(&path)
+        };
+        assert_eq!([1, 3, 6].map(noted), [false, true, true]);
+        write(&path, &whole).unwrap();
+        assert_eq!([path, dir.path().join("none.jpg")].map(|path| is_turned(&path)), [false, false]);
     }
 
     #[test]

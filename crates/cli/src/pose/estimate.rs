@@ -9,7 +9,7 @@ use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Light, Model, Pose6};
 use srn_data::camera::Axes;
 
-use super::files::{Masks, ObjectArgs, Picture, PoseSource, create_dir, model_side, srn_instance};
+use super::files::{Masks, ObjectArgs, Picture, PoseSource, create_dir, model_side, srn_instance, warn_of_turned};
 use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
@@ -236,6 +236,7 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
     let (any, mut names, mut pictures) = (model.instance_name(0), HashSet::new(), Vec::new());
     for (((path, cutout), (_, mask)), truth) in cutouts.into_iter().zip(masks).zip(truths) {
         let masks = Masks { cutout: cutout.map(PathBuf::as_path), mask: mask.map(PathBuf::as_path) };
+        warn_of_turned(path);
         let instance = if args.unseen { Some(any.as_str()) } else { args.object.instance.as_deref() };
         let picture = Picture::open(path, masks, model, side, instance, &args.object.camera)?;
         let mut picture = Picture { truth, ..picture };

@@ -212,6 +212,13 @@ pub fn model_side(model: &Model, picture: &Path) -> Result<u32> {
     }
 }
 
+/// Says so where a photograph is to be turned before it is looked at: its camera and its masks may be those of either.
+pub fn warn_of_turned(picture: &Path) {
+    if srn::is_turned(picture) {
+        eprintln!("warning: {}: by its EXIF it is to be turned; its pixels are taken as they are stored", picture.display());
+    }
+}
+
 /// Makes a folder with its parents.
 pub fn create_dir(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path).map_err(|error| format!("{}: {error}", path.display()).into())

@@ -7,7 +7,7 @@ use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Tracked, Tracker};
 
 use super::draw;
-use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side};
+use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side, warn_of_turned};
 use super::notation::NotationArgs;
 use super::search::{PoseError, SearchArgs, Starts, query, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
@@ -89,6 +89,7 @@ pub fn run(args: &Track) -> Result<bool> {
     // Whoever waits for a frame is ready for it.
     let first = frames.next().ok_or("stdin: no frame's path on it")??;
     let side = model_side(&model, &first)?;
+    warn_of_turned(&first);
     let mut animation = None;
     let mut tracker = None;
     let (mut errors, mut searches, mut trusted, mut count) = (Vec::new(), 0, true, 0);
