@@ -227,7 +227,7 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
             println!("{instance:<24} {fitted:>14} {unseen:>14}  {reflections}");
         }
         let deviations = match model.metadata.calibration {
-            Some(_) => "as those of other new objects were",
+            Some(_) => "stated, as learnt from other new objects",
             None => {
                 "none stated: how far off such objects are found, `sigma-pose calibrate --heldout` learns from others, fitted as these are by default"
             }
