@@ -15,7 +15,7 @@ const MOST: f64 = 1.5;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Shown {
     centre: DVec2,
-    /// The mean of squared distances from the centre.
+    /// Of the places of what is dark.
     covariance: DMat2,
 }
 

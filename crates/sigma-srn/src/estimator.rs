@@ -98,7 +98,8 @@ pub struct Options {
     /// axis of the camera.
     pub min_starts: usize,
     /// Whether starts are moved first, where [`Query::coverage`] is known: nearer or farther away, and turned about themselves, until the object is as large and
-    /// at the same place in the views from there, as the first phase would show them, as in the image. Else their distance and aim are taken for known.
+    /// at the same place in the views from there, as the first phase would show them, as in the image; where a part of it is hidden, or as the whole of it would
+    /// be, whichever has the lower loss. Else their distance and aim are taken for known.
     pub align: bool,
     /// Phases, one after the other.
     pub phases: Vec<Phase>,

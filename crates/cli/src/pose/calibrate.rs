@@ -176,9 +176,7 @@ impl Report {
         };
         let (unexplained, rival) = (100.0 * unexplained, 100.0 * rival);
         lines.push(format!("trusted: at most {unexplained:.1} % unexplained,{of_each} and a loss {rival:.1} % higher elsewhere"));
-        for line in lines {
-            self.text += &format!("{line}\n");
-        }
+        self.text += &(lines.join("\n") + "\n");
     }
 }
 
@@ -239,7 +237,7 @@ struct Searches {
 
 impl Searches {
     fn run(args: &Calibrate, on: On, asked: &[Views], at_truth: &AtTruth, far_deg: f64) -> Result<Self> {
-        let symmetries = |views| if args.symmetries { Symmetries::of(on, views) } else { Ok(Symmetries::none()) };
+        let symmetries = |views| Symmetries::of(on, views, args.symmetries);
         let symmetries: Vec<Symmetries> = asked.iter().map(symmetries).collect::<Result<_>>()?;
         let known_of = |(views, symmetries): (&Views, &Symmetries), found: &[Found]| -> Vec<Known> {
             let each = found.iter().zip(&views.truths).zip(&views.pictures);

@@ -139,7 +139,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
 
     let mut results: Vec<(ViewReport, &Picture, Found)> = Vec::new();
     for ((views, source), found) in asked.iter().zip(sources).zip(found) {
-        let symmetries = if args.symmetries { Symmetries::of(on, views)? } else { Symmetries::none() };
+        let symmetries = Symmetries::of(on, views, args.symmetries)?;
         for ((picture, truth), found) in views.pictures.iter().zip(&views.truths).zip(found) {
             let truth = (truth, &symmetries);
             results.push((

@@ -33,9 +33,11 @@ impl Symmetries {
         Symmetries { turns: vec![], round: None }
     }
 
-    /// Those of the instance that these are views of, found by comparing the model's own from as far away.
-    pub fn of(on: On, views: &Views) -> Result<Self> {
-        let (Some(picture), Some(truth)) = (views.pictures.first(), views.truths.first()) else { return Ok(Symmetries::none()) };
+    /// Those of the instance that these are views of, found by comparing the model's own from as far away; none where they do not count.
+    pub fn of(on: On, views: &Views, count: bool) -> Result<Self> {
+        let (Some(picture), Some(truth), true) = (views.pictures.first(), views.truths.first(), count) else {
+            return Ok(Symmetries::none());
+        };
         Symmetries::find(on, picture.instance, picture.intrinsics, truth.w_axis.truncate().length())
     }
 

@@ -229,7 +229,7 @@ impl Bench<'_> {
                 _ if setting.preset.is_none() => Symmetries::none(),
                 Some((.., symmetries)) => symmetries.clone(),
                 None => {
-                    let found = if self.args.symmetries { Symmetries::of(on, views)? } else { Symmetries::none() };
+                    let found = Symmetries::of(on, views, self.args.symmetries)?;
                     self.symmetries.push((setting.table == 2, views.name.clone(), found.clone()));
                     found
                 }
