@@ -4,7 +4,7 @@ use sigma_srn::{Descent, Engine, Error, Method, Model, ModelConfig, Options, Que
 use sigma_srn::{camera, estimate};
 use srn_tests::{assert_close, difference, gpu};
 
-use crate::lockstep::{engines, share_inputs, step_by_step};
+use crate::lockstep::{engines, share_buffers, step_by_step};
 use crate::{INSTANCES, RAYS, SIZE, batch, intrinsics, model, poses};
 
 /// The instance that is baked.
@@ -101,7 +101,7 @@ fn every_kernel_of_its_plan_is_right() {
         descent
     });
     let (subject, reference) = (subject.executor(), reference.executor());
-    share_inputs(subject, reference);
+    share_buffers(subject, reference);
     let instances = step_by_step(subject, reference, "instances");
     assert_eq!(instances.into_keys().collect::<Vec<_>>(), ["embedding/forward"], "nothing but copies");
     for stage in ["begin", "evaluate"] {

@@ -1,14 +1,15 @@
 //! Steps whose rows do not know each other run in chains: a thread takes a block of rows through all steps of a chain before it takes the
 //! next, so that what one step leaves is in the cache when the next one wants it.
 
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
 use std::ops::Range;
+use std::thread::LocalKey;
 
 use srn_plan::{BufferId, Step};
 use srn_shaders::{
     AdvanceParams, DensitySumParams, DepthParams, ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams,
-    RaysParams,
+    RaysParams, TileParams,
 };
 
 /// Rows of a block: what it reads and writes in a step should stay in a core's cache.
@@ -38,19 +39,62 @@ pub fn part_rows(tile_rows: usize, features: usize) -> usize {
 }
 
 thread_local! {
-    static ALONE: Cell<bool> = const { Cell::new(false) };
+    /// How many blocks this thread has begun, and whether it works on the last of them.
+    static BLOCK: Cell<(u64, bool)> = const { Cell::new((0, false)) };
 }
 
 /// Works on one of many blocks, while other threads work on others.
 pub(crate) fn alone(work: impl FnOnce()) {
-    ALONE.set(true);
+    let (number, _) = BLOCK.get();
+    BLOCK.set((number + 1, true));
     work();
-    ALONE.set(false);
+    BLOCK.set((number + 1, false));
 }
 
 /// Whether this thread works on one of many blocks.
 pub(crate) fn is_alone() -> bool {
-    ALONE.get()
+    let (_, is_alone) = BLOCK.get();
+    is_alone
+}
+
+/// What a thread has made of weights, by their address and number. They stay as they are while it works on a block: a step that wrote them would have ended the chain.
+pub(crate) struct Kept<V> {
+    block: u64,
+    /// What was used longest ago first: every tile of a block wants them in the same order.
+    made: Vec<((usize, usize), V)>,
+    spare: Vec<V>,
+}
+
+/// More are not kept: a block may meet the weights of many objects.
+const MOST_KEPT: usize = 64;
+
+impl<V> Default for Kept<V> {
+    fn default() -> Self {
+        Kept { block: 0, made: vec![], spare: vec![] }
+    }
+}
+
+/// Works with what was made of `weights` in this block, or is made now; `make` may use what is no longer wanted.
+pub(crate) fn with_kept<V>(
+    kept: &'static LocalKey<RefCell<Kept<V>>>,
+    weights: &[f32],
+    make: impl FnOnce(Option<V>) -> V,
+    work: impl FnOnce(&V),
+) {
+    let name = (weights.as_ptr() as usize, weights.len());
+    let made = kept.with_borrow_mut(|Kept { block, made, spare }| {
+        let (number, is_alone) = BLOCK.get();
+        if !is_alone || *block != number || made.len() == MOST_KEPT {
+            *block = number;
+            spare.extend(made.drain(..).map(|(_, value)| value));
+        }
+        match made.iter().position(|(known, _)| *known == name) {
+            Some(place) => made.remove(place).1,
+            None => make(spare.pop()),
+        }
+    });
+    work(&made);
+    kept.with_borrow_mut(|kept| kept.made.push((name, made)));
 }
 
 /// Parameters of kernels that make each row of their outputs from the same row of their inputs, or sums over parts of the rows.
@@ -116,6 +160,17 @@ rows_of_groups! {
     DepthParams: |_| true;
 }
 
+impl RowWise for TileParams {
+    fn rows(&self) -> usize {
+        (self.groups * self.rows_per_group) as usize
+    }
+
+    fn block(self, rows: Range<usize>) -> Self {
+        let rows = rows.len() as u32;
+        Self { groups: 1, rows_per_group: rows, first_group: 0, first_row: 0, rows_per_image: rows, ..self }
+    }
+}
+
 impl RowWise for LinearParams {
     fn rows(&self) -> usize {
         (self.groups * self.rows_per_group) as usize
@@ -160,10 +215,27 @@ impl RowWise for LayerNormParams {
 pub(crate) enum Share {
     /// All of it, as every block has.
     Whole,
-    /// So many values for each of its rows.
-    Row(usize),
+    /// So many values for each of its rows, of which the step's first is so far into the buffer.
+    Row { values: usize, first: usize },
     /// So many values.
     Block(usize),
+}
+
+impl Share {
+    /// Whether these are other rows of a buffer than those, where there are so many of either.
+    fn is_apart_from(self, other: Share, rows: usize) -> bool {
+        match (self, other) {
+            (Share::Row { values, first }, Share::Row { values: others, first: others_first }) => {
+                values == others && first.abs_diff(others_first) >= rows
+            }
+            _ => false,
+        }
+    }
+
+    /// The values of the buffer that `rows` rows of a step have; none where that does not depend on rows.
+    pub fn values(self, rows: usize) -> Range<usize> {
+        if let Share::Row { values, first } = self { values * first..values * (first + rows) } else { 0..0 }
+    }
 }
 
 /// How a step falls apart into rows.
@@ -186,12 +258,21 @@ impl Split {
     }
 }
 
-/// A buffer of a chain.
+/// What a chain has of a buffer.
 #[derive(Debug)]
 pub(crate) struct Place {
-    pub buffer: BufferId,
     pub share: Share,
-    pub written: bool,
+    written: bool,
+}
+
+/// A buffer of a chain with the numbers of its places there.
+#[derive(Debug)]
+pub(crate) struct Buffer {
+    pub id: BufferId,
+    /// Whether a step writes to any of them.
+    pub is_written: bool,
+    /// Those that begin earlier in the buffer first.
+    pub places: Vec<usize>,
 }
 
 /// A step of a chain; numbers are those of [`Chain::places`].
@@ -208,11 +289,12 @@ pub(crate) struct Chain {
     pub steps: Range<usize>,
     pub links: Vec<Link>,
     pub places: Vec<Place>,
-    /// Numbers of the places that a buffer has.
-    places_of: HashMap<BufferId, Vec<usize>>,
+    pub buffers: Vec<Buffer>,
+    /// Numbers of the buffers.
+    numbers: HashMap<BufferId, usize>,
     /// Rows of each block, in order; none where the step is done as a whole.
     pub blocks: Vec<Range<usize>>,
-    rows: usize,
+    pub rows: usize,
     rows_per_group: Option<usize>,
     chunk_rows: Option<usize>,
 }
@@ -230,13 +312,16 @@ impl Chain {
         }
         let threads = rayon::current_num_threads();
         for chain in &mut chains {
-            let values = |place: &Place| if let Share::Row(values) = place.share { values } else { 0 };
+            let values = |place: &Place| if let Share::Row { values, .. } = place.share { values } else { 0 };
             let widest = chain.places.iter().map(values).max().unwrap_or(0);
             let group = chain.rows_per_group.unwrap_or(chain.rows).max(1);
             chain.blocks = match chain.chunk_rows {
                 Some(chunk) => parts(chain.rows, group, chunk),
                 None => blocks(chain.rows, group, widest, threads),
             };
+            for buffer in &mut chain.buffers {
+                buffer.places.sort_by_key(|&place| chain.places[place].share.values(0).start);
+            }
         }
         chains
     }
@@ -248,7 +333,8 @@ impl Chain {
             steps: number..number,
             links: vec![],
             places: vec![],
-            places_of: HashMap::new(),
+            buffers: vec![],
+            numbers: HashMap::new(),
             blocks: vec![],
             rows: split.rows,
             rows_per_group: None,
@@ -264,21 +350,30 @@ impl Chain {
         let parts_agree = agree(self.rows_per_group, split.rows_per_group) && agree(self.chunk_rows, split.chunk_rows);
         let bindings = || step.buffers.iter().zip(&split.shares).zip(step.kernel.bindings);
         let fits = |((&buffer, &share), binding): ((&BufferId, &Share), &srn_shaders::Binding)| {
-            let mut known = self.places_of.get(&buffer).into_iter().flatten().map(|&place| &self.places[place]);
-            known.all(|known| known.share == share || !known.written && !binding.written)
+            let places = self.numbers.get(&buffer).map_or(&[][..], |&number| &self.buffers[number].places);
+            let mut known = places.iter().map(|&place| &self.places[place]);
+            known.all(|known| {
+                let is_only_read = !known.written && !binding.written;
+                is_only_read || known.share == share || known.share.is_apart_from(share, self.rows)
+            })
         };
         if split.rows != self.rows || !parts_agree || !bindings().all(fits) {
             return false;
         }
         let mut link = Link { inputs: vec![], outputs: vec![] };
         for ((&buffer, &share), binding) in bindings() {
-            let known = self.places_of.entry(buffer).or_default();
-            let place = known.iter().copied().find(|&place| self.places[place].share == share).unwrap_or_else(|| {
-                self.places.push(Place { buffer, share, written: false });
-                known.push(self.places.len() - 1);
+            let number = *self.numbers.entry(buffer).or_insert_with(|| {
+                self.buffers.push(Buffer { id: buffer, is_written: false, places: vec![] });
+                self.buffers.len() - 1
+            });
+            let known = &mut self.buffers[number];
+            let place = known.places.iter().copied().find(|&place| self.places[place].share == share).unwrap_or_else(|| {
+                self.places.push(Place { share, written: false });
+                known.places.push(self.places.len() - 1);
                 self.places.len() - 1
             });
             self.places[place].written |= binding.written;
+            known.is_written |= binding.written;
             if binding.written { &mut link.outputs } else { &mut link.inputs }.push(place);
         }
         self.links.push(link);
@@ -308,7 +403,8 @@ fn blocks(rows: usize, group: usize, values: usize, threads: usize) -> Vec<Range
 #[cfg(test)]
 mod tests {
     use srn_plan::ops::linear::{self, Layer, Sets};
-    use srn_plan::{Builder, Parts, Rows};
+    use srn_plan::ops::tile;
+    use srn_plan::{Builder, Parts, Rows, Tile};
 
     use super::*;
     use crate::executor::split;
@@ -347,6 +443,34 @@ mod tests {
         }
         let lengths = chains[1][0].blocks.iter().map(ExactSizeIterator::len).collect::<Vec<_>>();
         assert_eq!(lengths, [86, 86, 84, 86, 86, 84, 86, 86, 84], "the parts");
+    }
+
+    /// Tiles use the same buffers one after the other, and other rows of what is whole.
+    #[test]
+    fn tiles_belong_to_a_chain_where_they_are_apart() {
+        let lengths_of = |first_rows: [u32; 3]| {
+            let mut b = Builder::new(u64::MAX);
+            let [whole, weights, made] =
+                [("whole", 1536 * 4), ("weights", 20), ("made", 1536 * 4)].map(|(name, len)| b.input(name, len).unwrap());
+            let slots = b.input_u32("slots", 1).unwrap();
+            let [x, y] = ["x", "y"].map(|name| b.scratch(name, 512 * 4).unwrap());
+            b.stage("tiles");
+            for first_row in first_rows {
+                let rows = Rows { groups: 1, rows_per_group: 512, first_group: 0 };
+                let cut = Tile { rows, first_row, rows_per_image: 1536 };
+                let layer = Layer { in_features: 4, out_features: 4, weights, sets: Sets::Shared };
+                tile::gather(&mut b, cut, 4, whole, x).unwrap();
+                linear::forward(&mut b, rows, layer, x, slots, y, false).unwrap();
+                tile::scatter(&mut b, cut, 4, y, made).unwrap();
+            }
+            let plan = b.finish().unwrap();
+            Chain::of(&plan.stages[0].steps, split).iter().map(|chain| chain.steps.len()).collect::<Vec<_>>()
+        };
+        assert_eq!(lengths_of([0, 512, 1024]), [9]);
+        assert_eq!(lengths_of([1024, 0, 512]), [9]);
+        // The third tile's rows are in part the first's, for another thread.
+        assert_eq!(lengths_of([0, 512, 256]), [8, 1]);
+        assert_eq!(lengths_of([0, 512, 0]), [9]);
     }
 
     #[test]

@@ -4,11 +4,12 @@ use rayon::prelude::*;
 use srn_plan::{BufferId, Element, Executor, ExecutorError, Plan, StageId, Step};
 use srn_shaders::{
     AdvanceParams, DensitySumParams, DepthParams, ImageLossParams, LayerNormParams, LinearParams, LstmParams, PointLayerParams,
-    RaysParams,
+    RaysParams, TileParams,
 };
 
 use crate::aligned::Aligned;
 use crate::chain::{Chain, Link, RowWise, Share, Split};
+use crate::ops::tile;
 use crate::{Real, chain, hidden_layer, ops};
 
 /// The values of one buffer.
@@ -214,27 +215,30 @@ impl<T: Real> CpuExecutor<T> {
 
     /// Runs the steps of a chain. What they write is taken out for that time, so that blocks of it can be borrowed beside what they read.
     fn execute(buffers: &mut [Storage<T>], steps: &[Step], chain: &Chain) {
-        let taken = chain.places.iter().filter(|place| place.written);
-        let mut taken: Vec<Storage<T>> = taken.map(|place| std::mem::take(&mut buffers[place.buffer.index()])).collect();
-        let mut blocks: Vec<Vec<Part<T>>> = Vec::new();
-        blocks.resize_with(chain.blocks.len().max(1), || Vec::with_capacity(chain.places.len()));
+        let take = |buffer: &chain::Buffer| std::mem::take(&mut buffers[buffer.id.index()]);
+        let mut taken: Vec<Storage<T>> = chain.buffers.iter().filter(|buffer| buffer.is_written).map(take).collect();
+        let of_block = || std::iter::repeat_with(Part::default).take(chain.places.len()).collect();
+        let mut blocks: Vec<Vec<Part<T>>> = std::iter::repeat_with(of_block).take(chain.blocks.len().max(1)).collect();
         let mut written = taken.iter_mut();
-        for place in &chain.places {
-            let mut rest = match place.written {
-                true => written.next().expect("one is taken for each").whole_mut(),
-                false => buffers[place.buffer.index()].whole(),
-            };
-            match place.share {
-                Share::Whole => {
-                    let (last, others) = blocks.split_last_mut().expect("there is at least one");
-                    others.iter_mut().for_each(|block| block.push(rest.again()));
-                    last.push(rest);
+        for buffer in &chain.buffers {
+            // Places of what is written are apart from each other, those of what is only read may not be.
+            let mut rest = buffer.is_written.then(|| written.next().expect("one is taken for each").whole_mut());
+            let mut begins_at = 0;
+            for &place in &buffer.places {
+                let share = chain.places[place].share;
+                match &mut rest {
+                    Some(rest) => {
+                        let values = share.values(chain.rows);
+                        rest.split_off(values.start - begins_at);
+                        begins_at = values.end;
+                        deal(rest, place, share, chain, &mut blocks);
+                    }
+                    None => {
+                        let mut whole = buffers[buffer.id.index()].whole();
+                        whole.split_off(share.values(chain.rows).start);
+                        deal(&mut whole, place, share, chain, &mut blocks);
+                    }
                 }
-                Share::Row(values) => {
-                    let rows = chain.blocks.iter().map(ExactSizeIterator::len);
-                    blocks.iter_mut().zip(rows).for_each(|(block, rows)| block.push(rest.split_off(values * rows)));
-                }
-                Share::Block(values) => blocks.iter_mut().for_each(|block| block.push(rest.split_off(values))),
             }
         }
         let run = |(number, mut parts): (usize, Vec<Part<T>>)| {
@@ -257,8 +261,8 @@ impl<T: Real> CpuExecutor<T> {
         } else {
             blocks.into_par_iter().enumerate().for_each(|block| chain::alone(|| run(block)));
         }
-        for (place, storage) in chain.places.iter().filter(|place| place.written).zip(taken) {
-            buffers[place.buffer.index()] = storage;
+        for (buffer, storage) in chain.buffers.iter().filter(|buffer| buffer.is_written).zip(taken) {
+            buffers[buffer.id.index()] = storage;
         }
     }
 }
@@ -331,6 +335,22 @@ impl<T: Real> Executor for CpuExecutor<T> {
     }
 }
 
+/// Gives each block of a chain its share of a place.
+fn deal<'a, T>(rest: &mut Part<'a, T>, place: usize, share: Share, chain: &Chain, blocks: &mut [Vec<Part<'a, T>>]) {
+    match share {
+        Share::Whole => {
+            let (last, others) = blocks.split_last_mut().expect("there is at least one");
+            others.iter_mut().for_each(|block| block[place] = rest.again());
+            last[place] = std::mem::take(rest);
+        }
+        Share::Row { values, .. } => {
+            let rows = chain.blocks.iter().map(ExactSizeIterator::len);
+            blocks.iter_mut().zip(rows).for_each(|(block, rows)| block[place] = rest.split_off(values * rows));
+        }
+        Share::Block(values) => blocks.iter_mut().for_each(|block| block[place] = rest.split_off(values)),
+    }
+}
+
 /// Runs the first two steps on a block of rows, if they are a linear layer and its norm, forward or back, that go together.
 fn both_of_a_layer<T: Real>(steps: &[Step], rows: &Range<usize>, parts: &mut [Part<T>], links: &[Link]) -> bool {
     let ([first, second, ..], [one, two, ..]) = (steps, links) else { return false };
@@ -390,11 +410,11 @@ const OUTPUTS: usize = 3;
 
 /// Lists the references once: `op/direction` with the element types of inputs and outputs, in the order of the bindings. Those of `rows`
 /// make each row from the same row of what they read, or sums over each part of the rows; with the values of a row in each binding, 0 where
-/// all rows read the same, and those of a sum.
+/// all rows read the same, and those of a sum; where the step's rows are not the first of a buffer, with the number of the one that is, unless they are not side by side there.
 macro_rules! references {
     (
         rows { $($row:literal => $row_op:ident::$row_direction:ident($($row_input:ident)*) -> ($($row_output:ident)*),
-            |$p:ident: $params:ty| $widths:expr $(, sum of $sum:expr)?;)* }
+            |$p:ident: $params:ty| $widths:expr $(, from [$($first:expr),*] unless $scattered:expr)? $(, sum of $sum:expr)?;)* }
         whole { $($name:literal => $op:ident::$direction:ident($($input:ident)*) -> ($($output:ident)*);)* }
     ) => {
         /// Runs a step on a block of rows, or as a whole.
@@ -407,7 +427,7 @@ macro_rules! references {
             let mut written = outputs.iter_mut();
             match step.kernel.name {
                 $($row => ops::$row_op::$row_direction(
-                    step.params::<$params>().block(rows.expect("these have blocks").clone()),
+                    rows.map_or(step.params(), |rows| step.params::<$params>().block(rows.clone())),
                     $(inputs.next().expect("the builder checks the number of buffers").$row_input(),)*
                     $(written.next().expect("the builder checks the number of buffers").$row_output(),)*
                 ),)*
@@ -428,9 +448,16 @@ macro_rules! references {
             match step.kernel.name {
                 $($row => {
                     let $p: $params = step.params();
+                    $(if $scattered {
+                        return None;
+                    })?
                     let widths: &[u32] = &$widths;
-                    let share = |&width: &u32| if width == 0 { Share::Whole } else { Share::Row(width as usize) };
-                    let shares = widths.iter().map(share)$(.chain([Share::Block($sum as usize)]))?.collect();
+                    let firsts = [$($($first),*)?].into_iter().chain(std::iter::repeat(0usize));
+                    let share = |(&width, first): (&u32, usize)| match width as usize {
+                        0 => Share::Whole,
+                        values => Share::Row { values, first },
+                    };
+                    let shares = widths.iter().zip(firsts).map(share)$(.chain([Share::Block($sum as usize)]))?.collect();
                     Some(Split::of(&$p, shares))
                 })*
                 _ => None,
@@ -445,6 +472,8 @@ macro_rules! references {
 references! {
     rows {
         "rays/forward" => rays::forward(f f f f) -> (f_mut f_mut), |_p: RaysParams| [0, 0, 2, 1, 3, 3];
+        "tile/gather" => tile::gather(f) -> (f_mut), |p: TileParams| [p.columns, p.columns], from [tile::first(p), 0] unless tile::has_gaps(p);
+        "tile/scatter" => tile::scatter(f) -> (f_mut), |p: TileParams| [p.columns, p.columns], from [0, tile::first(p)] unless tile::has_gaps(p);
         "linear/forward" => linear::forward(f f u) -> (f_mut), |p: LinearParams| [p.in_features, 0, 0, p.out_features];
         "linear/backward_input" => linear::backward_input(f f u) -> (f_mut), |p: LinearParams| [p.out_features, 0, 0, p.in_features];
         "linear/backward_weight" => linear::backward_weight(f f) -> (f_mut), |p: LinearParams| [p.in_features, p.out_features],
@@ -475,8 +504,6 @@ references! {
         "pose/forward" => pose::forward(f) -> (f_mut);
         "pose/backward" => pose::backward(f f) -> (f_mut);
         "rays/backward" => rays::backward(f f f f f f) -> (f_mut);
-        "tile/gather" => tile::gather(f) -> (f_mut);
-        "tile/scatter" => tile::scatter(f) -> (f_mut);
         "embedding/forward" => embedding::forward(f u) -> (f_mut);
         "embedding/backward" => embedding::backward(u f) -> (f_mut);
         "depth_loss/forward" => depth_loss::forward(f) -> (f_mut);

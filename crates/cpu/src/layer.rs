@@ -5,6 +5,7 @@ use std::cell::RefCell;
 use pulp::{Arch, Simd, WithSimd};
 
 use crate::aligned::{self, Aligned};
+use crate::chain::{Kept, with_kept};
 
 /// Inputs at a time: their weights for as many outputs as have their sums in registers stay in the first cache.
 const DEPTH: usize = 128;
@@ -79,8 +80,10 @@ pub(crate) fn is_for(ins: usize, outs: usize) -> bool {
 
 /// Works with a layer for which [`is_for`] holds.
 pub(crate) fn with_layer(ins: usize, outs: usize, weights: Weights, work: impl FnOnce(&Layer)) {
+    // The two directions differ.
     thread_local! {
-        static IN_ORDER: RefCell<Aligned<f32>> = RefCell::new(Aligned::zeros(0));
+        static FORWARD: RefCell<Kept<Aligned<f32>>> = RefCell::default();
+        static BACK: RefCell<Kept<Aligned<f32>>> = RefCell::default();
     }
     assert!(is_for(ins, outs));
     let (length, columns) = (ins * outs, columns());
@@ -89,24 +92,27 @@ pub(crate) fn with_layer(ins: usize, outs: usize, weights: Weights, work: impl F
     {
         return work(&Layer { ins, outs, values: &values[..length] });
     }
-    IN_ORDER.with_borrow_mut(|in_order| {
-        if in_order.values().len() < length {
-            *in_order = Aligned::zeros(length);
-        }
-        let in_order = &mut in_order.values_mut()[..length];
-        for (first, to) in (0..outs).step_by(columns).zip(in_order.chunks_mut(columns * ins)) {
+    let (kept, values) = match weights {
+        Weights::OutputsByInputs(values) => (&FORWARD, &values[..length]),
+        Weights::InputsByOutputs(values) => (&BACK, &values[..length]),
+    };
+    let in_order = |spare: Option<Aligned<f32>>| {
+        let mut in_order = spare.filter(|spare| spare.values().len() >= length).unwrap_or_else(|| Aligned::zeros(length));
+        let parts = in_order.values_mut()[..length].chunks_mut(columns * ins);
+        for (first, to) in (0..outs).step_by(columns).zip(parts) {
             let columns = to.len() / ins;
             match weights {
-                Weights::OutputsByInputs(values) => transpose(&values[first * ins..][..columns * ins], ins, to),
-                Weights::InputsByOutputs(values) => {
-                    for (from, to) in values[..length].chunks_exact(outs).zip(to.chunks_exact_mut(columns)) {
+                Weights::OutputsByInputs(_) => transpose(&values[first * ins..][..columns * ins], ins, to),
+                Weights::InputsByOutputs(_) => {
+                    for (from, to) in values.chunks_exact(outs).zip(to.chunks_exact_mut(columns)) {
                         to.copy_from_slice(&from[first..first + columns]);
                     }
                 }
             }
         }
-        work(&Layer { ins, outs, values: in_order });
-    });
+        in_order
+    };
+    with_kept(kept, values, in_order, |in_order| work(&Layer { ins, outs, values: &in_order.values()[..length] }));
 }
 
 impl Layer<'_> {

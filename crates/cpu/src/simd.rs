@@ -93,12 +93,11 @@ fn polynomial<S: Simd, const N: usize>(simd: S, x: S::f32s, coefficients: [f32; 
     sum
 }
 
-/// `e^x = 2^n · e^r` with `|r| ≤ ln 2 / 2` and a polynomial of degree 7 for `e^r`: relative error below 2e-7, no branches.
+/// `2^n` and `e^r - 1`, with `e^x = 2^n · e^r`, `|r| ≤ ln 2 / 2`, and a polynomial of degree 7 for `e^r`: relative error below 2e-7, no branches.
 #[inline(always)]
-fn exponential<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
-    let (lowest, highest) = (simd.splat_f32s(-87.0), simd.splat_f32s(88.0));
-    let x = simd.select_f32s(simd.less_than_f32s(x, lowest), lowest, x);
-    let x = simd.select_f32s(simd.greater_than_f32s(x, highest), highest, x);
+fn exponential<S: Simd>(simd: S, x: S::f32s) -> (S::f32s, S::f32s) {
+    // In this order a NaN goes on.
+    let x = simd.min_f32s(simd.splat_f32s(88.0), simd.max_f32s(simd.splat_f32s(-87.0), x));
     let magic = simd.splat_f32s(12_582_912.0); // 1.5 · 2^23: adding it rounds to an integer
     let shifted = simd.mul_add_e_f32s(x, simd.splat_f32s(std::f32::consts::LOG2_E), magic);
     let n = simd.sub_f32s(shifted, magic);
@@ -106,39 +105,26 @@ fn exponential<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
     let r = simd.mul_add_e_f32s(n, simd.splat_f32s(-0.693_359_4), x);
     let r = simd.mul_add_e_f32s(n, simd.splat_f32s(2.121_944_4e-4), r);
     let p = polynomial(simd, r, [1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5]);
-    let one = simd.splat_f32s(1.0);
-    let p = simd.add_f32s(one, simd.mul_add_e_f32s(simd.mul_f32s(r, r), p, r));
     // The low bits of `shifted` are n: no conversion to an integer is needed.
     let power = simd.add_u32s(simd.transmute_u32s_f32s(shifted), simd.splat_u32s(127));
-    let power = simd.wrapping_dyn_shl_u32s(power, simd.splat_u32s(23));
-    simd.mul_f32s(p, simd.transmute_f32s_u32s(power))
+    let power = simd.transmute_f32s_u32s(simd.wrapping_dyn_shl_u32s(power, simd.splat_u32s(23)));
+    (power, simd.mul_add_e_f32s(simd.mul_f32s(r, r), p, r))
 }
 
 /// `1 / (1 + e^-x)`.
 #[inline(always)]
 pub(crate) fn sigmoid<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
     let one = simd.splat_f32s(1.0);
-    simd.div_f32s(one, simd.add_f32s(one, exponential(simd, simd.neg_f32s(x))))
+    let (power, rest) = exponential(simd, simd.neg_f32s(x));
+    simd.div_f32s(one, simd.add_f32s(one, simd.mul_add_e_f32s(power, rest, power)))
 }
 
-/// Coefficients of `(tanh x - x) / x³` in `x²` (Cephes), the highest power first.
-const TANH: [f32; 5] = [
-    -5.704_988_727_455_282e-3_f64 as f32,
-    2.063_908_879_545_3e-2_f64 as f32,
-    -5.373_971_297_310_02e-2_f64 as f32,
-    1.333_144_197_585_25e-1_f64 as f32,
-    -3.333_328_194_227_63e-1_f64 as f32,
-];
-
-/// `tanh x`: a polynomial near zero (Cephes), where the quotient of exponentials would cancel.
+/// `tanh x = (e^2x - 1) / (e^2x + 1)`, `e^2x - 1` without what would cancel near zero.
 #[inline(always)]
 pub(crate) fn hyperbolic_tangent<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
-    let (one, two) = (simd.splat_f32s(1.0), simd.splat_f32s(2.0));
-    let e = exponential(simd, simd.add_f32s(x, x));
-    let far = simd.sub_f32s(one, simd.div_f32s(two, simd.add_f32s(e, one)));
-    let square = simd.mul_f32s(x, x);
-    let near = simd.mul_add_e_f32s(simd.mul_f32s(x, square), polynomial(simd, square, TANH), x);
-    simd.select_f32s(simd.less_than_f32s(simd.abs_f32s(x), simd.splat_f32s(0.625)), near, far)
+    let (power, rest) = exponential(simd, simd.add_f32s(x, x));
+    let less_one = simd.mul_add_e_f32s(power, rest, simd.sub_f32s(power, simd.splat_f32s(1.0)));
+    simd.div_f32s(less_one, simd.add_f32s(less_one, simd.splat_f32s(2.0)))
 }
 
 #[cfg(test)]

@@ -4,8 +4,9 @@
 use std::iter::zip;
 
 use srn_plan::ops::bfgs::{self, Channel, Residuals};
+use srn_plan::ops::rays::Pixels;
 use srn_plan::ops::{adam, gmsd, image_loss, pose, rays, tile as tile_ops};
-use srn_plan::{BufferId, Builder, Executor, PlanError, StageId, Tile, tiles};
+use srn_plan::{BufferId, Builder, Executor, PlanError, Rows, StageId, Tile, tiles};
 
 use crate::camera::{Pose6, from_rows, to_rows};
 use crate::engine::{Engine, Runner};
@@ -438,9 +439,10 @@ impl Comparison {
         let Shape { hypotheses, width, height, .. } = shape;
         let n = hypotheses as usize;
         let images = gmsd::Images { count: hypotheses, width, height };
-        let of_tile = |tile: &Tile| rays::partial_len(tile.rows).max(bfgs::partial_len(tile.rows));
+        let of_tile = |tile: &Tile| bfgs::partial_len(tile.rows);
+        let of_rays = rays::partial_len(Rows { groups: hypotheses, rows_per_group: width * height, first_group: 0 });
         let of_images = image_loss::partial_len(hypotheses, width * height).max(images.partial_len());
-        let partial = b.scratch("partial sums", cut.iter().map(of_tile).max().unwrap_or(1).max(of_images))?;
+        let partial = b.scratch("partial sums", cut.iter().map(of_tile).max().unwrap_or(1).max(of_images).max(of_rays))?;
         let kind = match loss {
             Some(kind) => Kind::PerPixel { kind, count: b.scratch("target count", n)? },
             None => {
@@ -547,10 +549,13 @@ impl Parts<'_> {
         })
     }
 
-    /// Renders, compares, and goes back to the poses: losses, and `d_matrix [hypotheses, 12]`.
+    /// Renders, compares, and goes back to the poses: losses, and `d_matrix [hypotheses, 12]`. Every tile takes the same steps, one after the other, so that
+    /// on the CPU no thread waits for another until all are done.
     fn differentiate(&self, b: &mut Builder, scratch: &Scratch, back: Back, d_matrix: BufferId) -> Result<(), PlanError> {
-        let &Parts { network, saved, target, cut, comparison, shape: Shape { width, height, .. } } = self;
+        let &Parts { network, saved, target, cut, comparison, shape: Shape { hypotheses, width, height, .. } } = self;
         let &Comparison { partial, loss, .. } = comparison;
+        let mut of_rays = |name: &str| b.scratch(name, 3 * (hypotheses * width * height) as usize);
+        let (d_origin, d_direction) = (of_rays("d origins")?, of_rays("d directions")?);
         let tile_d_rgb = b.scratch("tile d rgb", 3 * saved.rows as usize)?;
         let mut started = Started::default();
         // A loss of whole images needs all tiles before the first gradient; the tiles are rendered once more on the way back.
@@ -574,10 +579,12 @@ impl Parts<'_> {
                 }
             }
             backward::render(b, network, saved, scratch, tile, tile_d_rgb, false, &mut started)?;
-            let accumulate = started.accumulate(d_matrix, tile.rows.first_group);
-            let pixels = network.pixels(saved);
-            rays::backward(b, tile.rows, pixels, scratch.d_origin, scratch.d_direction, partial, d_matrix, accumulate)?;
+            tile_ops::scatter(b, tile, 3, scratch.d_origin, d_origin)?;
+            tile_ops::scatter(b, tile, 3, scratch.d_direction, d_direction)?;
         }
+        let all = Rows { groups: hypotheses, rows_per_group: width * height, first_group: 0 };
+        let pixels = Pixels { uv: network.uv, z0: network.z0, ..network.pixels(saved) };
+        rays::backward(b, all, pixels, d_origin, d_direction, partial, d_matrix, false)?;
         if matches!(back, Back::PerPixel { .. }) {
             self.losses(b)?;
         }

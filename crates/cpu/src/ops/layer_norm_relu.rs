@@ -203,23 +203,25 @@ impl<const CENTRED: bool> Rows for Backward<'_, CENTRED> {
             let (mut sums, mut along, mut es) = ([zero; SUMS], [zero; SUMS], [zero; FEW]);
             for first in (0..V).step_by(SUMS) {
                 for ((sum, along), v) in sums.iter_mut().zip(&mut along).zip(first..V) {
-                    let normalised = simd.mul_f32s(if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) }, rstds);
+                    let centred = if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) };
+                    let normalised = simd.mul_f32s(centred, rstds);
                     let live = simd.greater_than_f32s(simd.mul_add_e_f32s(normalised, gamma[v], beta[v]), zero);
                     let e = simd.select_f32s(live, simd.mul_f32s(gamma[v], d_y[v]), zero);
                     if !CENTRED {
                         *sum = simd.add_f32s(*sum, e);
                     }
-                    *along = simd.mul_add_e_f32s(e, normalised, *along);
+                    *along = simd.mul_add_e_f32s(e, centred, *along);
                     if V <= FEW { es[v] = e } else { d_x[v] = e }
                 }
             }
             let mean_e = if CENTRED { zero } else { simd.splat_f32s(total(simd, sums) * inverse) };
-            let mean_along = simd.splat_f32s(total(simd, along) * inverse);
+            // x̂ mean(e x̂) is x - mean times this.
+            let along = simd.splat_f32s(total(simd, along) * inverse * rstd * rstd);
             for v in 0..V {
-                let normalised = simd.mul_f32s(if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) }, rstds);
+                let centred = if CENTRED { x[v] } else { simd.sub_f32s(x[v], means) };
                 let e = if V <= FEW { es[v] } else { d_x[v] };
                 let e = if CENTRED { e } else { simd.sub_f32s(e, mean_e) };
-                d_x[v] = simd.mul_f32s(rstds, simd.negate_mul_add_e_f32s(normalised, mean_along, e));
+                d_x[v] = simd.mul_f32s(rstds, simd.negate_mul_add_e_f32s(centred, along, e));
             }
         }
     }

@@ -1,12 +1,15 @@
 //! `z = W x + b`, then [`super::layer_norm_relu`]: the first layer of a network of points. It keeps nothing: to make `z` again from three
 //! numbers is cheaper than to read it.
 
+use std::cell::RefCell;
+
 use pulp::{Arch, Simd, WithSimd};
 use srn_shaders::{LayerNormParams, LinearParams, PointLayerParams};
 
 use super::layer_norm_relu::EPSILON;
 use super::{layer_norm_relu, linear, set_of};
 use crate::Real;
+use crate::chain::{Kept, with_kept};
 use crate::simd::{load, store, sum, vectorised};
 
 /// Rows that take turns, so that none waits for its own sums.
@@ -22,7 +25,7 @@ pub fn forward<T: Real>(p: PointLayerParams, x: &[T], weights: &[T], slots: &[u3
     {
         let groups = x.chunks_exact(3 * rows).zip(y.chunks_exact_mut(rows * width)).take(p.groups as usize);
         for (group, (x, y)) in groups.enumerate() {
-            Arch::new().dispatch(Forward { layer: &Centred::of(p, weights, slots, group, affine), x, y });
+            with_centred(p, weights, slots, group, |layer| Arch::new().dispatch(Forward { layer, affine, x, y }));
         }
         return;
     }
@@ -45,8 +48,9 @@ pub fn backward_input<T: Real>(
     {
         let groups = x.chunks_exact(3 * rows).zip(d_y.chunks_exact(rows * width)).zip(d_x.chunks_exact_mut(3 * rows));
         for (group, ((x, d_y), d_x)) in groups.enumerate().take(p.groups as usize) {
-            let layer = &Centred::of(p, weights, slots, group, affine);
-            Arch::new().dispatch(Backward { layer, x, d_y, d_x, accumulate });
+            with_centred(p, weights, slots, group, |layer| {
+                Arch::new().dispatch(Backward { layer, affine, x, d_y, d_x, accumulate });
+            });
         }
         return;
     }
@@ -106,24 +110,31 @@ vectorised! {
 
 /// A layer whose output has no mean before the norm, so that none has to be taken off: its weights have none. The variance then is a square
 /// form of the point, which in `f64` is at least as exact as the sum over the features, and takes none.
-struct Centred<'a> {
+struct Centred {
     width: usize,
     /// The columns of `W`, then the bias, each less its mean over the features.
     columns: Vec<f32>,
     /// Means over the features of the product of each two columns.
     products: [[f64; COLUMNS]; COLUMNS],
-    affine: &'a [f32],
 }
 
-impl<'a> Centred<'a> {
-    fn of(p: PointLayerParams, weights: &[f32], slots: &[u32], group: usize, affine: &'a [f32]) -> Self {
-        let width = p.features as usize;
-        let weights = set_of(weights, COLUMNS * width, p.weight_stride, slots, p.first_group as usize + group);
+/// Works with the layer of a group.
+fn with_centred(p: PointLayerParams, weights: &[f32], slots: &[u32], group: usize, work: impl FnOnce(&Centred)) {
+    thread_local! {
+        static CENTRED: RefCell<Kept<Centred>> = RefCell::default();
+    }
+    let width = p.features as usize;
+    let weights = set_of(weights, COLUMNS * width, p.weight_stride, slots, p.first_group as usize + group);
+    with_kept(&CENTRED, weights, |_| Centred::of(width, weights), work);
+}
+
+impl Centred {
+    fn of(width: usize, weights: &[f32]) -> Self {
         let (weight, bias) = weights.split_at(3 * width);
         let rows = (0..3).flat_map(|i| weight.iter().skip(i).step_by(3));
         let mut columns: Vec<f64> = rows.chain(bias).map(|&value| value.into()).collect();
         let products = centre(&mut columns);
-        Centred { width, columns: columns.iter().map(|&value| value as f32).collect(), products, affine: &affine[..2 * width] }
+        Centred { width, columns: columns.iter().map(|&value| value as f32).collect(), products }
     }
 
     /// For the point `p`: rstd, and the mean over the features of `z` times each column.
@@ -150,13 +161,13 @@ struct Features<V> {
 
 impl<V: Copy> Features<V> {
     #[inline(always)]
-    fn load<S: Simd<f32s = V>>(simd: S, layer: &Centred, start: usize) -> Self {
+    fn load<S: Simd<f32s = V>>(simd: S, layer: &Centred, affine: &[f32], start: usize) -> Self {
         let mut columns = [simd.splat_f32s(0.0); COLUMNS];
         for (vector, column) in columns.iter_mut().zip(layer.columns.chunks_exact(layer.width)) {
             *vector = load(simd, column, start);
         }
-        let (gamma, beta) = layer.affine.split_at(layer.width);
-        Features { columns, gamma: load(simd, gamma, start), beta: load(simd, beta, start) }
+        let (gamma, beta) = affine.split_at(layer.width);
+        Features { columns, gamma: load(simd, gamma, start), beta: load(simd, &beta[..layer.width], start) }
     }
 
     /// `z` of a point, and `gamma x̂ + beta`.
@@ -172,21 +183,22 @@ impl<V: Copy> Features<V> {
 
 /// [`forward`] of one group with the processor's vectors.
 struct Forward<'a> {
-    layer: &'a Centred<'a>,
+    layer: &'a Centred,
+    affine: &'a [f32],
     x: &'a [f32],
     y: &'a mut [f32],
 }
 
 impl Forward<'_> {
     #[inline(always)]
-    fn rows<S: Simd, const N: usize>(simd: S, layer: &Centred, x: &[[f32; 3]; N], y: &mut [f32]) {
+    fn rows<S: Simd, const N: usize>(simd: S, layer: &Centred, affine: &[f32], x: &[[f32; 3]; N], y: &mut [f32]) {
         let zero = simd.splat_f32s(0.0);
         let mut rstds = [zero; N];
         for row in 0..N {
             rstds[row] = simd.splat_f32s(layer.moments(&x[row]).0);
         }
         for start in (0..layer.width).step_by(S::F32_LANES) {
-            let features = Features::load(simd, layer, start);
+            let features = Features::load(simd, layer, affine, start);
             for row in 0..N {
                 let (_, value) = features.of(simd, &x[row], rstds[row]);
                 let y = &mut y[row * layer.width..(row + 1) * layer.width];
@@ -201,21 +213,22 @@ impl WithSimd for Forward<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Forward { layer, x, y } = self;
+        let Forward { layer, affine, x, y } = self;
         let (fours, others) = x.as_chunks().0.as_chunks::<ROWS>();
         let (y_of_fours, y_of_others) = y.split_at_mut(fours.len() * ROWS * layer.width);
         for (x, y) in fours.iter().zip(y_of_fours.chunks_exact_mut(ROWS * layer.width)) {
-            Self::rows(simd, layer, x, y);
+            Self::rows(simd, layer, affine, x, y);
         }
         for (&x, y) in others.iter().zip(y_of_others.chunks_exact_mut(layer.width)) {
-            Self::rows(simd, layer, &[x], y);
+            Self::rows(simd, layer, affine, &[x], y);
         }
     }
 }
 
 /// [`backward_input`] of one group with the processor's vectors.
 struct Backward<'a> {
-    layer: &'a Centred<'a>,
+    layer: &'a Centred,
+    affine: &'a [f32],
     x: &'a [f32],
     d_y: &'a [f32],
     d_x: &'a mut [f32],
@@ -225,7 +238,7 @@ struct Backward<'a> {
 impl Backward<'_> {
     /// The gradients to `N` points.
     #[inline(always)]
-    fn rows<S: Simd, const N: usize>(simd: S, layer: &Centred, x: &[[f32; 3]; N], d_y: &[f32]) -> [[f32; 3]; N] {
+    fn rows<S: Simd, const N: usize>(simd: S, layer: &Centred, affine: &[f32], x: &[[f32; 3]; N], d_y: &[f32]) -> [[f32; 3]; N] {
         let zero = simd.splat_f32s(0.0);
         let (mut moments, mut rstds) = ([(0.0, [0.0; 3]); N], [zero; N]);
         for row in 0..N {
@@ -235,7 +248,7 @@ impl Backward<'_> {
         // Sums over the features of e times z, and e times each column. The columns have no mean: they take mean(e) to nothing.
         let (mut along, mut across) = ([zero; N], [[zero; 3]; N]);
         for start in (0..layer.width).step_by(S::F32_LANES) {
-            let features = Features::load(simd, layer, start);
+            let features = Features::load(simd, layer, affine, start);
             for row in 0..N {
                 let (z, value) = features.of(simd, &x[row], rstds[row]);
                 let d_y = load(simd, &d_y[row * layer.width..(row + 1) * layer.width], start);
@@ -263,7 +276,7 @@ impl WithSimd for Backward<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Backward { layer, x, d_y, d_x, accumulate } = self;
+        let Backward { layer, affine, x, d_y, d_x, accumulate } = self;
         let (fours, others) = x.as_chunks().0.as_chunks::<ROWS>();
         let (d_y_of_fours, d_y_of_others) = d_y.split_at(fours.len() * ROWS * layer.width);
         let (d_x_of_fours, d_x_of_others) = d_x.split_at_mut(fours.len() * ROWS * 3);
@@ -274,11 +287,11 @@ impl WithSimd for Backward<'_> {
         };
         let rows = fours.iter().zip(d_y_of_fours.chunks_exact(ROWS * layer.width)).zip(d_x_of_fours.chunks_exact_mut(ROWS * 3));
         for ((x, d_y), d_x) in rows {
-            put(d_x, &Self::rows(simd, layer, x, d_y));
+            put(d_x, &Self::rows(simd, layer, affine, x, d_y));
         }
         for ((&x, d_y), d_x) in others.iter().zip(d_y_of_others.chunks_exact(layer.width)).zip(d_x_of_others.chunks_exact_mut(3))
         {
-            put(d_x, &Self::rows(simd, layer, &[x], d_y));
+            put(d_x, &Self::rows(simd, layer, affine, &[x], d_y));
         }
     }
 }

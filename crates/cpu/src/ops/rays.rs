@@ -1,6 +1,7 @@
 //! Pixels to rays: `q = ((u-cx)/fx, (v-cy)/fy, 1)`, `direction = normalize(R q)`, `origin = t + s direction + R (z0 q)`, where `s` is how far
 //! a ray's beginning lies from the camera.
 
+use rayon::prelude::*;
 use srn_shaders::RaysParams;
 
 use super::chunk_of;
@@ -89,7 +90,8 @@ pub fn backward<T: Real>(
     d_direction: &[T],
     partial: &mut [T],
 ) {
-    for (index, partial) in partial.chunks_exact_mut(12).take((p.groups * p.chunks) as usize).enumerate() {
+    let partials = partial.par_chunks_exact_mut(12).take((p.groups * p.chunks) as usize);
+    partials.enumerate().for_each(|(index, partial)| {
         let (group, chunk) = (index / p.chunks as usize, index % p.chunks as usize);
         let image = p.first_group as usize + group;
         let m = &world_from_camera[12 * image..12 * image + 12];
@@ -118,5 +120,5 @@ pub fn backward<T: Real>(
         for (partial, sum) in partial.iter_mut().zip(sums) {
             *partial = T::of(sum);
         }
-    }
+    });
 }

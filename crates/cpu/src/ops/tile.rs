@@ -2,6 +2,16 @@
 
 use srn_shaders::TileParams;
 
+/// Number of the tile's first row in the whole.
+pub(crate) fn first(p: TileParams) -> usize {
+    (p.first_group * p.rows_per_image + p.first_row) as usize
+}
+
+/// Whether its rows are not side by side there: those of one image are, and those of whole images.
+pub(crate) fn has_gaps(p: TileParams) -> bool {
+    p.groups > 1 && p.rows_per_group < p.rows_per_image
+}
+
 /// `(place in the part, place in the whole)` of each group's rows, with their common length.
 fn spans(p: TileParams) -> impl Iterator<Item = (usize, usize, usize)> {
     let length = (p.rows_per_group * p.columns) as usize;
