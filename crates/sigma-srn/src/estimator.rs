@@ -300,9 +300,7 @@ pub fn estimate(
             let pose = Pose6::from_matrix(matrix);
             Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, promise: 0.0, phases: 0, dilation: q.dilation }
         };
-        let around = (q.starts.len() < options.min_starts).then(|| q.starts.iter().flat_map(turned));
-        let starts: Vec<DMat4> = q.starts.iter().copied().chain(around.into_iter().flatten()).collect();
-        hypotheses.extend(starts.iter().enumerate().map(new));
+        hypotheses.extend(starts_of(q, options).iter().enumerate().map(new));
     }
     let gradients_of = |engine: &Engine, tried: &[Hypothesis], stride: u32| {
         let phase = Phase { stride, ..options.phases[0] };
@@ -567,6 +565,22 @@ fn is_gmsd(method: Method) -> bool {
     matches!(method, Method::Adam { loss: Loss::Gmsd, .. })
 }
 
+/// The starts of an image, and those that are added.
+fn starts_of(query: &Query, options: &Options) -> Vec<DMat4> {
+    let around = (query.starts.len() < options.min_starts).then(|| query.starts.iter().flat_map(turned));
+    query.starts.iter().copied().chain(around.into_iter().flatten()).collect()
+}
+
+/// How many rays an image has in the phase in which it has the most.
+pub(crate) fn most_rays(query: &Query, options: &Options) -> usize {
+    let starts = starts_of(query, options).len();
+    let rays = |phase: &Phase| {
+        let tried = if phase.dilate { DILATIONS.len() } else { 1 };
+        tried * starts.min(phase.keep) * rays_of(query, phase.stride).count()
+    };
+    options.phases.iter().map(rays).max().unwrap_or(0)
+}
+
 /// A camera turned about the object by 40°, to either side about each of its axes.
 fn turned(world_from_camera: &DMat4) -> impl Iterator<Item = DMat4> {
     let axes = [world_from_camera.x_axis, world_from_camera.y_axis, world_from_camera.z_axis];
@@ -749,7 +763,8 @@ fn prepare(
     Ok((targets.descent(engine, model, method, is_moving, running)?, lights))
 }
 
-fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Error> {
+/// Says what is wrong with what is asked for.
+pub(crate) fn check(model: &Model, queries: &[Query], options: &Options) -> Result<(), Error> {
     let setting = |field, what: &str| Err(Error::Setting { field, what: what.into() });
     if queries.is_empty() {
         return setting("queries", "there are none");

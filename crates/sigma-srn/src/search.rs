@@ -4,10 +4,14 @@ use glam::DMat4;
 use web_time::Instant;
 
 use crate::confidence::{Confidence, Doubt, hidden_doubt, unexplained, unexplained_doubt};
-use crate::estimator::{Effort, Estimate, Options, Progress, Query, at_work, estimate};
+use crate::estimator::{Effort, Estimate, Options, Progress, Query, at_work, check, estimate, most_rays};
 use crate::renderer::{View, render_views};
 use crate::unseen::estimate_unseen;
 use crate::{Engine, Error, Model};
+
+/// Rays that are cast side by side, but for those of a single image: enough to fill a large GPU. Each few hundred have some hundred steps of the plan, and
+/// those of a thousand images would not fit into the memory of a machine.
+const AT_ONCE: usize = 1 << 20;
 
 /// Searches that follow one another until there is a pose to be trusted. By default those of [`Effort::Normal`].
 #[derive(Clone, Debug, PartialEq)]
@@ -60,7 +64,7 @@ impl Search {
         Search { tries: [effort].into_iter().chain(then).map(Options::of).collect(), accept: None }
     }
 
-    /// Searches for the poses of all queries in one batch, then for each again that is not to be trusted. `observe` sees what that of
+    /// Searches for the poses of all queries, as many side by side as pays, then for each again that is not to be trusted. `observe` sees what that of
     /// [`estimate`] does, [`Progress::search`] says in which search.
     pub fn run(
         &self,
@@ -73,11 +77,11 @@ impl Search {
         let began = Instant::now();
         let (model, queries) = &at_work(model, queries)?;
         let before = began.elapsed().as_secs_f64() / queries.len() as f64;
-        let mut all = self.once(engine, model, queries, first, &mut observe)?;
+        let mut all = self.once(engine, model, queries, first, AT_ONCE, &mut observe)?;
         all.iter_mut().for_each(|found| found.seconds += before);
         for (search, options) in (1..).zip(others) {
             for (i, found) in all.iter_mut().enumerate().filter(|(_, found)| !found.is_trusted()) {
-                let mut again = self.once(engine, model, &queries[i..=i], options, |progress| {
+                let mut again = self.once(engine, model, &queries[i..=i], options, AT_ONCE, |progress| {
                     let hypotheses: Vec<_> = progress.hypotheses.iter().map(|(_, start)| (i, *start)).collect();
                     observe(Progress { search, hypotheses: &hypotheses, ..progress })
                 })?;
@@ -122,24 +126,39 @@ impl Search {
         self.tries.split_first().ok_or_else(|| Error::Setting { field: "tries", what: "there are none".into() })
     }
 
+    /// One search for all queries, at most `at_once` rays side by side.
     fn once(
         &self,
         engine: &Engine,
         model: &Model,
         queries: &[Query],
         options: &Options,
-        observe: impl FnMut(Progress) -> Result<(), Error>,
+        at_once: usize,
+        mut observe: impl FnMut(Progress) -> Result<(), Error>,
     ) -> Result<Vec<Found>, Error> {
-        let began = Instant::now();
-        let estimates = estimate(engine, model, queries, options, observe)?;
-        let seconds = began.elapsed().as_secs_f64() / queries.len() as f64;
-        let views: Vec<View> = queries.iter().zip(&estimates).map(|(query, estimate)| view(query, estimate)).collect();
-        let views = render_views(engine, model, [queries[0].width, queries[0].height], &views)?;
-        let found = queries.iter().zip(estimates).zip(views).map(|((query, estimate), view)| {
-            let doubt = |estimate: &Estimate, unexplained| estimate.doubt(model, query.instance, unexplained);
-            self.judged(model, query, estimate, view.rgb, seconds, doubt)
-        });
-        Ok(found.collect())
+        check(model, queries, options)?;
+        let mut all = Vec::new();
+        let portions = portions(queries, options, at_once);
+        let (mut left, mut before) = (portions.len() as u32, 0);
+        for portion in portions {
+            let began = Instant::now();
+            let (first, mut done) = (all.len(), 0);
+            let estimates = estimate(engine, model, portion, options, |progress| {
+                done = progress.step;
+                let hypotheses: Vec<_> = progress.hypotheses.iter().map(|(query, start)| (first + query, *start)).collect();
+                let (step, steps) = (before + progress.step, before + left * progress.steps);
+                observe(Progress { step, steps, hypotheses: &hypotheses, ..progress })
+            })?;
+            (left, before) = (left - 1, before + done);
+            let seconds = began.elapsed().as_secs_f64() / portion.len() as f64;
+            let views: Vec<View> = portion.iter().zip(&estimates).map(|(query, estimate)| view(query, estimate)).collect();
+            let views = render_views(engine, model, [portion[0].width, portion[0].height], &views)?;
+            all.extend(portion.iter().zip(estimates).zip(views).map(|((query, estimate), view)| {
+                let doubt = |estimate: &Estimate, unexplained| estimate.doubt(model, query.instance, unexplained);
+                self.judged(model, query, estimate, view.rgb, seconds, doubt)
+            }));
+        }
+        Ok(all)
     }
 
     /// `doubt`: why it is not to be trusted with so much of the image unexplained, unless [`Search::accept`] decides alone.
@@ -173,6 +192,21 @@ impl Found {
     }
 }
 
+/// The queries cut into portions of at most so many rays, but of one query at least.
+fn portions<'a>(queries: &'a [Query], options: &Options, most: usize) -> Vec<&'a [Query]> {
+    let (mut portions, mut from, mut rays) = (Vec::new(), 0, 0);
+    for (number, query) in queries.iter().enumerate() {
+        let own = most_rays(query, options);
+        if number > from && rays + own > most {
+            portions.push(&queries[from..number]);
+            (from, rays) = (number, 0);
+        }
+        rays += own;
+    }
+    portions.push(&queries[from..]);
+    portions
+}
+
 /// The view from an estimated pose.
 fn view(query: &Query, estimate: &Estimate) -> View {
     (query.instance, estimate.pose.to_matrix(), query.intrinsics)
@@ -186,11 +220,12 @@ mod tests {
     use crate::camera::fixed24;
     use crate::{Intrinsics, ModelConfig};
 
-    #[test]
-    fn what_is_not_trusted_is_searched_for_once_more() {
-        let model = Model::init(&ModelConfig { hidden: 8, latent: 4, instances: 1, tracing_steps: 2, density: true }, 3).unwrap();
-        let engine = Engine::cpu();
-        let of = |shade: f32| Query {
+    fn model() -> Model {
+        Model::init(&ModelConfig { hidden: 8, latent: 4, instances: 1, tracing_steps: 2, density: true }, 3).unwrap()
+    }
+
+    fn of(shade: f32) -> Query {
+        Query {
             instance: 0,
             rgb: (0..192).map(|k| shade - (k % 7) as f32 / 9.0).collect(),
             weights: None,
@@ -200,7 +235,44 @@ mod tests {
             height: 8,
             intrinsics: Intrinsics { fx: 9.0, fy: 9.0, cx: 4.0, cy: 4.0, pixel_center: 0.0 },
             starts: vec![fixed24(1.3)[5]],
+        }
+    }
+
+    #[test]
+    fn many_images_are_searched_for_in_portions() {
+        let (engine, model, search) = (Engine::cpu(), model(), Search::of(Effort::Fast));
+        let queries = [0.9, 0.7, 0.4].map(of);
+        let options = &search.tries[0];
+        let lengths = |most| portions(&queries, options, most).iter().map(|portion| portion.len()).collect::<Vec<_>>();
+        // Seven starts of 2 × 2 rays, six of 4 × 4 for the first descent to be at every second pixel, one or two of 8 × 8.
+        let one = most_rays(&queries[0], options);
+        assert_eq!([0, one, 2 * one, 3 * one].map(lengths), [vec![1, 1, 1], vec![1, 1, 1], vec![2, 1], vec![3]]);
+
+        let searched = |at_once| {
+            let mut seen = Vec::new();
+            let observe = |progress: Progress| {
+                seen.push((progress.step, progress.steps, progress.hypotheses.iter().map(|(query, _)| *query).max()));
+                Ok(())
+            };
+            let found = search.once(&engine, &model, &queries, options, at_once, observe).unwrap();
+            (found.iter().map(|found| found.estimate.pose).collect::<Vec<_>>(), seen)
         };
+        let ((together, _), (apart, seen)) = (searched(usize::MAX), searched(one));
+        let off = |(a, b): (&crate::Pose6, &crate::Pose6)| a.degrees_from(*b);
+        assert!(together.iter().zip(&apart).map(off).all(|degrees| degrees < 1e-3), "{together:?} {apart:?}");
+        assert!(seen.is_sorted_by_key(|(step, ..)| *step) && seen.is_sorted_by_key(|(.., query)| *query), "{seen:?}");
+        let (step, steps, query) = seen[seen.len() - 1];
+        assert_eq!((step, query), (steps, Some(2)));
+
+        let wrong = [of(0.9), Query { starts: vec![], ..of(0.9) }];
+        let error = search.once(&engine, &model, &wrong, options, 1, |_| Ok(())).unwrap_err().to_string();
+        assert!(error.contains("image 1"), "{error}");
+    }
+
+    #[test]
+    fn what_is_not_trusted_is_searched_for_once_more() {
+        let model = model();
+        let engine = Engine::cpu();
         // The searches, the images, and the losses that a call comes across.
         let searched = |search: &Search| {
             let (mut seen, mut lowest) = (BTreeSet::new(), [f64::INFINITY; 2]);

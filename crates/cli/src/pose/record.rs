@@ -57,13 +57,16 @@ impl Log {
         Ok(())
     }
 
-    /// The way of a start of a picture, in the search that has found its pose.
+    /// The way of a start of a picture, in the search that has found its pose. Steps count from where that begins with the picture.
     fn path(&self, picture: usize, start: usize, found: &Found) -> Vec<Point> {
+        let search = || self.0.iter().filter(|moment| moment.search + 1 == found.searches);
+        let is_of = |moment: &&Moment| moment.hypotheses.iter().any(|&(of, _)| of == picture);
+        let first = search().find(is_of).map_or(0, |moment| moment.step);
         let point = |moment: &Moment| {
             let i = moment.hypotheses.iter().position(|&name| name == (picture, start))?;
-            Some(Point { step: moment.step, loss: moment.losses[i], world_from_camera: moment.poses[i].to_matrix() })
+            Some(Point { step: moment.step - first, loss: moment.losses[i], world_from_camera: moment.poses[i].to_matrix() })
         };
-        self.0.iter().filter(|moment| moment.search + 1 == found.searches).filter_map(point).collect()
+        search().filter_map(point).collect()
     }
 
     /// Writes `NAME.png` and `NAME.gif` of picture number `index` to `dir`.
