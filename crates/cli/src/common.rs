@@ -171,12 +171,18 @@ pub fn refuse_to_write(path: &Path, force: bool) -> Result<()> {
     if !folder.is_dir() {
         return Err(format!("{}: its folder does not exist", path.display()).into());
     }
-    // Permissions say little of who may write where; a file does.
+    try_to_write(folder).map_err(|error| format!("{}: {error}", path.display()).into())
+}
+
+/// Makes a folder with its parents; fails if it cannot be written to.
+pub fn create_dir(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).and_then(|()| try_to_write(path)).map_err(|error| format!("{}: {error}", path.display()).into())
+}
+
+/// Permissions say little of who may write where; a file does.
+fn try_to_write(folder: &Path) -> std::io::Result<()> {
     let probe = folder.join(format!(".sigma-srn-{}", std::process::id()));
-    std::fs::File::create(&probe)
-        .and_then(|_| std::fs::remove_file(&probe))
-        .map_err(|error| format!("{}: {error}", path.display()))?;
-    Ok(())
+    std::fs::File::create(&probe).and_then(|_| std::fs::remove_file(&probe))
 }
 
 /// Prints a result on stdout; a full disk or a closed pipe is an error, not a panic.

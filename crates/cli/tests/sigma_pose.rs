@@ -702,6 +702,9 @@ fn a_mask_takes_pixels_out_of_the_search() {
     fail_with("--fov 53.5 --instance seat --mask small.png", &["small.png", "8×8"]);
     fail_with("--fov 53.5 --instance seat --cutout black.png", &["black.png", "nothing"]);
     fail_with("--fov 53.5 --instance seat --cutout small.png", &["small.png", "8×8"]);
+    // The picture lies in that folder; it is no mask of its own.
+    let itself = "estimate other/0156.png --model model.safetensors --fov 53.5 --instance seat --cutout other";
+    fail(dir, itself, &["other/0156.png", "the mask of"]);
 }
 
 /// The true pose, of which a mask leaves a patch in the middle of the object in sight.

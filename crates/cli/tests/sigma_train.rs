@@ -367,7 +367,7 @@ fn checkpoints_of_torch_come_and_go() {
         (import.clone(), &["model.safetensors", "exists already", "--force"][..]),
         (format!("export {model} --out {back}"), &["back.pth", "exists already"]),
         (format!("import {model} --out {new}"), &["model.safetensors", "not a file of torch.save"]),
-        (format!("import {CHECKPOINT} --out {new} --names {dir}/two.txt"), &["small.pth", "2 for 3"]),
+        (format!("import {CHECKPOINT} --out {new} --names {dir}/two.txt"), &["two.txt", "2 for 3"]),
         (format!("import {CHECKPOINT} --out {new} --names {dir}/none.txt"), &["none.txt"]),
         (format!("import {CHECKPOINT} --out {new} --tracing-steps 0"), &["--tracing-steps"]),
         (format!("export {back} --out {new}"), &["back.pth", "safetensors"]),

@@ -113,7 +113,8 @@ impl Picture {
 }
 
 /// Reads the mask of a picture of this size, row by row: 255 where the object is. A mask is white there; one that is transparent,
-/// as background removers write it, is opaque there.
+/// as background removers write it, is opaque there. A mask of black and one other value says the same, whatever that is: segmentations are also written with
+/// the number of the object, or in a colour.
 pub(crate) fn read_mask(path: &Path, [width, height]: [u32; 2]) -> Result<Vec<u8>> {
     let mask = decode(path)?.into_luma_alpha8();
     if mask.dimensions() != (width, height) {
@@ -121,7 +122,12 @@ pub(crate) fn read_mask(path: &Path, [width, height]: [u32; 2]) -> Result<Vec<u8
         return Err(Error::field(path, "size", expected, format!("{}×{}", mask.width(), mask.height())));
     }
     let channel = usize::from(mask.pixels().any(|mask| mask[1] < 255));
-    Ok(mask.pixels().map(|mask| mask[channel]).collect())
+    let mut mask: Vec<u8> = mask.pixels().map(|mask| mask[channel]).collect();
+    let white = mask.iter().copied().max().unwrap_or(0);
+    if mask.iter().all(|&value| value == 0 || value == white) {
+        mask.iter_mut().filter(|value| **value > 0).for_each(|value| *value = 255);
+    }
+    Ok(mask)
 }
 
 /// The corners of the box around points; `None` without points.
@@ -206,6 +212,21 @@ mod tests {
         let (_d, small) = saved(RgbImage::new(3, 2));
         let wrong = Picture::open(&alpha, Some(&small)).unwrap_err().to_string();
         assert!(wrong.contains("64×48") && wrong.contains("3×2"), "{wrong}");
+    }
+
+    #[test]
+    fn a_mask_of_two_values_is_black_and_white() {
+        let read = |values: [u8; 3]| {
+            let (_dir, path) = saved(image::GrayImage::from_raw(3, 1, values.to_vec()).unwrap());
+            read_mask(&path, [3, 1]).unwrap()
+        };
+        // Numbers of objects; all of it, and nothing; with edges in between.
+        let all = [[0, 1, 1], [7, 0, 7], [200, 0, 0], [9; 3], [0; 3], [0, 128, 255], [0, 3, 200]];
+        let expected = [[0, 255, 255], [255, 0, 255], [255, 0, 0], [255; 3], [0; 3], [0, 128, 255], [0, 3, 200]];
+        assert_eq!(all.map(read), expected);
+        // As a palette has it.
+        let (_dir, path) = saved(RgbImage::from_fn(3, 1, |x, _| Rgb([if x == 1 { 128 } else { 0 }, 0, 0])));
+        assert_eq!(read_mask(&path, [3, 1]).unwrap(), [0, 255, 0]);
     }
 
     #[test]

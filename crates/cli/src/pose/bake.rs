@@ -26,6 +26,9 @@ pub struct Bake {
 /// Runs the command.
 pub fn run(args: &Bake) -> Result<bool> {
     refuse_to_write(&args.out, args.force)?;
+    if let Some((_, again)) = args.instance.iter().enumerate().find(|(k, name)| args.instance[..*k].contains(name)) {
+        return Err(format!("--instance {again}: given twice").into());
+    }
     let model = load_model(&args.model)?;
     let about = |error| about_model(&args.model, error);
     let instances = args.instance.iter().map(|name| model.instance(name)).collect::<std::result::Result<Vec<_>, _>>();

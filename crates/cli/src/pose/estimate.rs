@@ -9,18 +9,18 @@ use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Light, Model, Pose6};
 use srn_data::camera::Axes;
 
-use super::files::{Masks, ObjectArgs, Picture, PoseSource, create_dir, model_side, srn_instance, warn_of_turned};
+use super::files::{Masks, ObjectArgs, Picture, PoseSource, model_side, srn_instance, warn_of_turned};
 use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
-use super::search::{On, PoseError, SearchArgs, Starts, run as search};
-use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing, refuse_to_write};
+use super::search::{On, PoseError, SearchArgs, Starts, deviation, run as search};
+use crate::common::{EngineArgs, Result, create_dir, load_model, print, progress, refuse_existing, refuse_to_write};
 
 /// Flags of `sigma-pose estimate`.
 #[derive(Args, Debug)]
 pub struct Estimate {
     /// Pictures of any size and colour type; transparency becomes white. A photograph that lies in no SRN folder is cut to a square
-    /// around what transparency, --cutout and --mask leave of it; with neither, to its middle. All are searched for in one batch.
+    /// around what transparency, --cutout and --mask leave of it; with neither, to its middle. Several are searched for side by side.
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
     #[command(flatten)]
@@ -143,6 +143,9 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let sources = args.images.iter().map(|path| args.poses.source(srn_instance(path).as_deref())).collect::<Result<Vec<_>>>()?;
     let default = if args.rough.is_empty() { Starts::Around84 } else { Starts::Neighbor4 };
     let starts = args.starts.as_ref().unwrap_or(&default);
+    if !args.rough.is_empty() && *starts != Starts::Neighbor4 {
+        return Err(format!("--rough is what --starts neighbor4 turns; {starts} does without it").into());
+    }
     let starts = |(picture, rough): (&Picture, &Option<DMat4>)| {
         args.search.starts(starts, &model, picture, side, rough.as_ref(), &notation)
     };
@@ -317,8 +320,7 @@ impl ImageReport {
         let [a, b, c, x, y, z] = Pose6::from_matrix(&notation.written(&found.world_from_camera)).0;
         let [a, b, c] = [a, b, c].map(f64::to_degrees);
         let verdict = self.doubt.map_or(String::new(), |doubt| format!("  DO NOT TRUST: {doubt}"));
-        let confidence = self.confidence.map(|confidence| notation.confidence(confidence));
-        let deviation = confidence.map_or(String::new(), |c| format!("  ± {:.2}° {:.4}", c.rotation_deg, c.translation));
+        let deviation = deviation(self.confidence.map(|confidence| notation.confidence(confidence)));
         let error = self.error.map_or(String::new(), |error| format!("  error {}", notation.error(error)));
         format!(
             "{}  {}  rotation {a:.2}° {b:.2}° {c:.2}°  centre {x:.4} {y:.4} {z:.4}{deviation}  loss {:.4}  unexplained {:.0} %  \

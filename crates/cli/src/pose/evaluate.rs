@@ -10,14 +10,14 @@ use srn_data::camera::Axes;
 use srn_data::sheet;
 
 use super::draw;
-use super::files::{Picture, create_dir, write_png};
+use super::files::{Picture, write_png};
 use super::notation::{Notation, NotationArgs};
 use super::search::{On, PoseError, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::tables;
 use super::views;
-use crate::common::{EngineArgs, Result, load_model, print, refuse_existing};
+use crate::common::{EngineArgs, Result, create_dir, load_model, print, refuse_existing};
 
 /// Side of a view on the sheet, pixels.
 const SHOWN: u32 = 128;

@@ -219,11 +219,6 @@ pub fn warn_of_turned(picture: &Path) {
     }
 }
 
-/// Makes a folder with its parents.
-pub fn create_dir(path: &Path) -> Result<()> {
-    std::fs::create_dir_all(path).map_err(|error| format!("{}: {error}", path.display()).into())
-}
-
 /// Writes a picture as PNG, whole or not at all.
 pub fn write_png(path: &Path, picture: &RgbImage) -> Result<()> {
     let mut bytes = std::io::Cursor::new(Vec::new());

@@ -8,7 +8,8 @@ use glam::DMat4;
 use serde::Serialize;
 use sigma_srn::camera::{around84, fixed24, neighbor4, pose_error};
 use sigma_srn::{
-    Effort, Engine, Error, Found, Loss, Method, Model, Options, Progress, Query, Rendering, Search, View, render_views,
+    Confidence, Effort, Engine, Error, Found, Loss, Method, Model, Options, Progress, Query, Rendering, Search, View,
+    render_views,
 };
 
 use super::files::Picture;
@@ -312,6 +313,17 @@ impl PoseError {
 impl std::fmt::Display for PoseError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{:.2}° {:.3}", self.rotation_deg, self.translation)
+    }
+}
+
+/// A stated deviation as it is printed, if there is one; one that takes in all turns says nothing.
+pub fn deviation(stated: Option<Confidence>) -> String {
+    match stated {
+        Some(Confidence { rotation_deg, translation, .. }) if rotation_deg < 180.0 => {
+            format!("  ± {rotation_deg:.2}° {translation:.4}")
+        }
+        Some(_) => "  ± anything".into(),
+        None => String::new(),
     }
 }
 

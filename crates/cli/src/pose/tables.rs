@@ -9,14 +9,14 @@ use srn_data::camera::Axes;
 use srn_data::sheet::{self, CURVES, Curve};
 
 use super::evaluate::{Evaluate, ViewReport, pictures_sheet, view_report};
-use super::files::{Picture, create_dir, write_png};
+use super::files::{Picture, write_png};
 use super::heldout::Heldout;
 use super::notation::Notation;
 use super::search::{LOSSES, On, PoseError, Preset, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::views::{self, Views};
-use crate::common::{Result, load_model, progress, refuse_existing};
+use crate::common::{Result, create_dir, load_model, progress, refuse_existing};
 use crate::train::adapt::Fit;
 
 /// Files that are written.

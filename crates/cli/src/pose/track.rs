@@ -9,7 +9,7 @@ use sigma_srn::{Confidence, Doubt, Found, Pose6, Tracked, Tracker};
 use super::draw;
 use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side, warn_of_turned};
 use super::notation::NotationArgs;
-use super::search::{PoseError, SearchArgs, Starts, query, with_cooperative_said};
+use super::search::{PoseError, SearchArgs, Starts, deviation, query, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
 
 /// Side of a frame in the animation, pixels.
@@ -20,7 +20,7 @@ const STAY: f64 = 0.1;
 /// Flags of `sigma-pose track`.
 #[derive(Args, Debug)]
 pub struct Track {
-    /// Frames in order, as `estimate` takes them; or a folder, whose pictures are taken by name; or `-`: their paths come on stdin, one per
+    /// Frames in order, as `estimate` takes them; or a folder, whose pictures are taken by name and number; or `-`: their paths come on stdin, one per
     /// line, and each is answered before the next is read. One after the first that is no picture, or has nothing of the object, is said to be so, and
     /// the next is taken.
     #[arg(required = true, value_name = "FRAME|DIR|-")]
@@ -83,6 +83,9 @@ pub fn run(args: &Track) -> Result<bool> {
     let mut frames = frames(&args.frames)?;
     let notation = args.poses.open()?;
     if let Some(path) = &args.record {
+        if path.extension().is_none_or(|ending| !ending.eq_ignore_ascii_case("gif")) {
+            return Err(format!("{}: --record writes an animation, a .gif", path.display()).into());
+        }
         refuse_to_write(path, args.force)?;
     }
     let engine = args.search.open(&args.engine)?;
@@ -174,7 +177,7 @@ pub fn run(args: &Track) -> Result<bool> {
 /// Paths of frames, as they come.
 type Frames = Box<dyn Iterator<Item = Result<PathBuf>>>;
 
-/// The pictures in a folder by name, those that stdin names, or the frames as they were given.
+/// The pictures in a folder in order, those that stdin names, or the frames as they were given.
 fn frames(given: &[PathBuf]) -> Result<Frames> {
     let paths = match given {
         [dash] if dash.as_os_str() == "-" => return Ok(Box::new(paths_on_stdin())),
@@ -197,16 +200,31 @@ fn paths_on_stdin() -> impl Iterator<Item = Result<PathBuf>> {
 fn pictures_in(dir: &Path) -> Result<Vec<PathBuf>> {
     let files = std::fs::read_dir(dir).map_err(|error| format!("{}: {error}", dir.display()))?;
     let mut frames = files.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
+    let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let is_picture = |path: &PathBuf| {
         let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-        ["png", "jpg", "jpeg"].contains(&ending.as_str())
+        // macOS leaves `._NAME.png` beside pictures, which is none.
+        ["png", "jpg", "jpeg"].contains(&ending.as_str()) && !name(path).starts_with('.')
     };
     frames.retain(is_picture);
-    frames.sort();
+    let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    frames.sort_by_cached_key(|path| (numbered(&stem(path)), path.clone()));
     if frames.is_empty() {
         return Err(format!("{}: no pictures (.png, .jpg) in it", dir.display()).into());
     }
     Ok(frames)
+}
+
+/// A name as its texts and the numbers after each: frame2 comes before frame10.
+fn numbered(name: &str) -> Vec<(String, u128)> {
+    let (mut parts, mut rest) = (Vec::new(), name);
+    while !rest.is_empty() {
+        let (text, from) = rest.split_at(rest.find(|c: char| c.is_ascii_digit()).unwrap_or(rest.len()));
+        let (number, after) = from.split_at(from.find(|c: char| !c.is_ascii_digit()).unwrap_or(from.len()));
+        parts.push((text.into(), number.parse().unwrap_or(0)));
+        rest = after;
+    }
+    parts
 }
 
 fn side_by_side(picture: &Picture, found: &Found, side: u32) -> image::RgbImage {
@@ -226,7 +244,7 @@ impl FrameReport<'_> {
     fn line(&self, pose: &Pose6) -> String {
         let [a, b, c, x, y, z] = pose.0;
         let [a, b, c] = [a, b, c].map(f64::to_degrees);
-        let deviation = self.confidence.map_or(String::new(), |c| format!("  ± {:.2}° {:.4}", c.rotation_deg, c.translation));
+        let deviation = deviation(self.confidence);
         let error = self.error.map_or(String::new(), |error| format!("  error {error}"));
         let searched = if self.searched { "  searched all around" } else { "" };
         let verdict = self.doubt.map_or(String::new(), |doubt| format!("  DO NOT TRUST: {doubt}"));
@@ -236,5 +254,30 @@ impl FrameReport<'_> {
             100.0 * self.unexplained,
             self.seconds
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_of_a_folder_come_in_the_order_of_their_numbers() {
+        let dir = tempfile::tempdir().unwrap();
+        let names = [
+            "frame10.png",
+            "frame9.JPG",
+            "frame.png",
+            "b2.jpeg",
+            "frame009.png",
+            "._frame1.png",
+            "notes.txt",
+            "b10x1.png",
+            "b10.png",
+        ];
+        names.iter().for_each(|name| std::fs::write(dir.path().join(name), "").unwrap());
+        let found = pictures_in(dir.path()).unwrap();
+        let found: Vec<_> = found.iter().map(|path| path.file_name().unwrap().to_str().unwrap()).collect();
+        assert_eq!(found, ["b2.jpeg", "b10.png", "b10x1.png", "frame.png", "frame009.png", "frame9.JPG", "frame10.png"]);
     }
 }

@@ -49,8 +49,11 @@ pub fn import(args: &ImportArgs) -> Result<bool> {
         None => vec![],
     };
     let metadata = Metadata { instance_names, side: Some(args.side), orbit_radius: Some(args.radius), ..Metadata::default() };
-    let (model, left_out) = Model::load_torch(&args.checkpoint, args.tracing_steps, metadata)
-        .map_err(|error| about_model(&args.checkpoint, error))?;
+    let (model, left_out) =
+        Model::load_torch(&args.checkpoint, args.tracing_steps, metadata).map_err(|error| match (&error, &args.names) {
+            (sigma_srn::Error::Input { input, .. }, Some(names)) if input == "instance names" => about_model(names, error),
+            _ => about_model(&args.checkpoint, error),
+        })?;
     model.save(&args.out)?;
     left_out.iter().for_each(|name| eprintln!("left out, no part of the network: {name}"));
     let (layout, latent) = (&model.layout, model.hypernetwork()?.latent);

@@ -292,7 +292,7 @@ impl<'a> Collector<'a> {
 }
 
 /// The mask of a picture in a folder of masks: `NAME.png` or, as COLMAP has it, `NAME.jpg.png`; below the folders that the picture
-/// is in, as far as there are such.
+/// is in, as far as there are such. The picture itself is none.
 pub fn mask_in(folder: &Path, image: &Path) -> Result<PathBuf> {
     let [stem, whole] =
         [image.file_stem(), image.file_name()].map(|name| name.unwrap_or_default().to_string_lossy().into_owned());
@@ -302,8 +302,12 @@ pub fn mask_in(folder: &Path, image: &Path) -> Result<PathBuf> {
     let folders = (0..=above.len()).map(|k| folder.join(above[k..].iter().collect::<PathBuf>()));
     folders
         .flat_map(|folder| names.each_ref().map(|name| folder.join(name)))
-        .find(|path| path.is_file())
+        .find(|path| path.is_file() && !is_same_file(path, image))
         .ok_or_else(|| Error::Missing { path: folder.join(&names[0]), why: format!("the mask of {}", image.display()) })
+}
+
+fn is_same_file(a: &Path, b: &Path) -> bool {
+    std::fs::canonicalize(a).is_ok_and(|a| std::fs::canonicalize(b).is_ok_and(|b| a == b))
 }
 
 /// The name of a folder or of the file's folder, fit to name a folder.
