@@ -65,8 +65,8 @@ impl Target {
             }
         }
         let counts = mask.map(|mask| counts(mask, size)).transpose()?;
-        let inside = |i: usize| opacity[i] > 0.5 && counts.as_ref().is_none_or(|counts| counts[i] > 0.5);
-        let points = (0..opacity.len()).filter(|&i| inside(i)).map(|i| [i % size[0], i / size[0]]);
+        let shown = |i: usize| opacity[i].min(counts.as_ref().map_or(1.0, |counts| counts[i]));
+        let points = (0..opacity.len()).filter(|&i| shown(i) > 0.5).map(|i| [i % size[0], i / size[0]]);
         let bounds = points.clone().fold(None, |bounds: Option<[[usize; 2]; 2]>, p| {
             let [low, high] = bounds.unwrap_or([p; 2]);
             Some([[0, 1].map(|k| low[k].min(p[k])), [0, 1].map(|k| high[k].max(p[k]))])
@@ -76,7 +76,7 @@ impl Target {
                 mask.or(cutout).unwrap_or(path),
                 "mask",
                 "white, or opaque, where the object is",
-                "nothing of it",
+                format!("nothing of it, at most {:.0} of 255", 255.0 * (0..opacity.len()).map(shown).fold(0.0, f32::max)),
             ));
         };
         if points.count() == opacity.len() {
