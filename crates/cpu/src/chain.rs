@@ -65,8 +65,8 @@ pub(crate) struct Kept<V> {
     spare: Vec<V>,
 }
 
-/// More are not kept: a block may meet the weights of many objects.
-const MOST_KEPT: usize = 64;
+/// Those of one object's layers, and some; a block may meet the weights of many objects, and at the paper's width these are a quarter of a megabyte each.
+const MOST_KEPT: usize = 32;
 
 impl<V> Default for Kept<V> {
     fn default() -> Self {
@@ -443,6 +443,29 @@ mod tests {
         }
         let lengths = chains[1][0].blocks.iter().map(ExactSizeIterator::len).collect::<Vec<_>>();
         assert_eq!(lengths, [86, 86, 84, 86, 86, 84, 86, 86, 84], "the parts");
+    }
+
+    #[test]
+    fn what_is_made_of_weights_is_kept_as_long_as_they_stay() {
+        thread_local! {
+            static NUMBERS: RefCell<Kept<usize>> = RefCell::default();
+        }
+        let weights = [0.0; 2 * MOST_KEPT];
+        let made = Cell::new(0);
+        let used = |weights: &[f32]| {
+            let mut used = 0;
+            let make = |_| made.replace(made.get() + 1);
+            with_kept(&NUMBERS, weights, make, |&number| used = number);
+            used
+        };
+        let both = || [used(&weights[..2]), used(&weights[2..4]), used(&weights[..2]), used(&weights[..3])];
+        alone(|| assert_eq!(both(), [0, 1, 0, 2]));
+        alone(|| assert_eq!(both(), [3, 4, 3, 5], "other weights may be there now"));
+        assert_eq!(both(), [6, 7, 8, 9], "outside of a block nobody knows how long they stay");
+        alone(|| {
+            (0..2 * MOST_KEPT).for_each(|k| assert_eq!(used(&weights[k..]), 10 + k));
+            NUMBERS.with_borrow(|Kept { made, spare, .. }| assert!(made.len() + spare.len() <= MOST_KEPT + 1));
+        });
     }
 
     /// Tiles use the same buffers one after the other, and other rows of what is whole.

@@ -410,7 +410,8 @@ const OUTPUTS: usize = 3;
 
 /// Lists the references once: `op/direction` with the element types of inputs and outputs, in the order of the bindings. Those of `rows`
 /// make each row from the same row of what they read, or sums over each part of the rows; with the values of a row in each binding, 0 where
-/// all rows read the same, and those of a sum; where the step's rows are not the first of a buffer, with the number of the one that is, unless they are not side by side there.
+/// all rows read the same, and those of a sum; of rows
+/// of the whole batch, with the number of the first in each binding, unless they are not side by side there.
 macro_rules! references {
     (
         rows { $($row:literal => $row_op:ident::$row_direction:ident($($row_input:ident)*) -> ($($row_output:ident)*),
@@ -472,8 +473,10 @@ macro_rules! references {
 references! {
     rows {
         "rays/forward" => rays::forward(f f f f) -> (f_mut f_mut), |_p: RaysParams| [0, 0, 2, 1, 3, 3];
-        "tile/gather" => tile::gather(f) -> (f_mut), |p: TileParams| [p.columns, p.columns], from [tile::first(p), 0] unless tile::has_gaps(p);
-        "tile/scatter" => tile::scatter(f) -> (f_mut), |p: TileParams| [p.columns, p.columns], from [0, tile::first(p)] unless tile::has_gaps(p);
+        "tile/gather" => tile::gather(f) -> (f_mut), |p: TileParams| [p.columns, p.columns],
+            from [tile::first(p), 0] unless tile::has_gaps(p);
+        "tile/scatter" => tile::scatter(f) -> (f_mut), |p: TileParams| [p.columns, p.columns],
+            from [0, tile::first(p)] unless tile::has_gaps(p);
         "linear/forward" => linear::forward(f f u) -> (f_mut), |p: LinearParams| [p.in_features, 0, 0, p.out_features];
         "linear/backward_input" => linear::backward_input(f f u) -> (f_mut), |p: LinearParams| [p.out_features, 0, 0, p.in_features];
         "linear/backward_weight" => linear::backward_weight(f f) -> (f_mut), |p: LinearParams| [p.in_features, p.out_features],
