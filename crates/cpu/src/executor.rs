@@ -296,12 +296,13 @@ impl<T: Real> Executor for CpuExecutor<T> {
 
     fn run(&mut self, stage: StageId) -> Result<(), ExecutorError> {
         let (chains, steps, buffers) = (&self.chains[stage.index()], &self.plan.stages[stage.index()].steps, &mut self.buffers);
-        // In a thread of the pool: one outside would fall asleep and be woken for each chain, and so would the pool.
-        rayon::scope(|_| {
-            for chain in chains {
-                Self::execute(buffers, &steps[chain.steps.clone()], chain);
-            }
-        });
+        let mut all = || chains.iter().for_each(|chain| Self::execute(buffers, &steps[chain.steps.clone()], chain));
+        // In a thread of the pool: one outside would fall asleep and be woken for each chain, and so would the pool. For a few numbers that is not worth it.
+        if chains.iter().any(|chain| chain.blocks.len() > 1) {
+            rayon::scope(|_| all());
+        } else {
+            all();
+        }
         Ok(())
     }
 
