@@ -244,7 +244,6 @@ mod tests {
         let queries = [0.9, 0.7, 0.4].map(of);
         let options = &search.tries[0];
         let lengths = |most| portions(&queries, options, most).iter().map(|portion| portion.len()).collect::<Vec<_>>();
-        // Seven starts of 2 × 2 rays, six of 4 × 4 for the first descent to be at every second pixel, one or two of 8 × 8.
         let one = most_rays(&queries[0], options);
         assert_eq!([0, one, 2 * one, 3 * one].map(lengths), [vec![1, 1, 1], vec![1, 1, 1], vec![2, 1], vec![3]]);
 
