@@ -31,6 +31,9 @@ const ALONE_ROWS: u32 = 4096;
 const MANY_TURNS: usize = 9;
 const TURNS: usize = 3;
 const LONG: f64 = 30.0;
+/// Seconds of a turn, at least: a shorter work is done over and over, as a search does its steps. A step of a few milliseconds between others would find
+/// none of its numbers in the cache.
+const LEAST: f64 = 0.2;
 /// Hypotheses and side of the image, from one to the other end of what is asked for.
 const SCALING: [(u32, u32); 8] = [(5, 16), (5, 32), (5, 64), (5, 128), (1, 32), (5, 32), (24, 32), (120, 32)];
 
@@ -85,13 +88,13 @@ struct KernelRow {
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error>>;
 
-/// Something that is timed: one turn of it takes so many seconds.
-type Turn<'a> = Box<dyn FnMut() -> Result<f64> + 'a>;
+/// Something that is timed: it has taken so many seconds.
+type Timed<'a> = Box<dyn FnMut() -> Result<f64> + 'a>;
 
 /// A work of ours: its row of the table, without times yet.
 struct Work {
     row: Row,
-    turn: Turn<'static>,
+    once: Timed<'static>,
 }
 
 /// What one run finds.
@@ -203,9 +206,9 @@ fn run() -> Result<()> {
 
 impl Report {
     /// Works of ours, and the steps of the peers whose names begin with `what` they do, take turns: one that pays for first use, and `turns`
-    /// that are timed. The rows of ours; those of the peers are kept.
+    /// that are timed, of [`LEAST`] seconds. The rows of ours; those of the peers are kept.
     fn take_turns(&mut self, turns: usize, works: Vec<Work>, what: &str, peers: &[RefCell<Peer>]) -> Result<Vec<Row>> {
-        let (mut rows, mut all): (Vec<Row>, Vec<Turn>) = works.into_iter().map(|work| (work.row, work.turn)).unzip();
+        let (mut rows, mut all): (Vec<Row>, Vec<Timed>) = works.into_iter().map(|work| (work.row, work.once)).unzip();
         let width = rows[0].width;
         let mut peer_rows = Vec::new();
         for peer in peers {
@@ -229,9 +232,12 @@ impl Report {
                     continue;
                 }
                 let rate = sgemm_rate();
-                let time = work()?;
+                let mut times = vec![work()?];
+                while times.iter().sum::<f64>() < LEAST {
+                    times.push(work()?);
+                }
                 if turn > 0 {
-                    seconds.push(time);
+                    seconds.extend(times);
                     rates.push(rate);
                 }
             }
@@ -356,12 +362,12 @@ impl Bench<'_> {
     fn work(&self, work: &str, flops: u64, bytes: u64, mut once: impl FnMut() -> Result<()> + 'static) -> Work {
         let (width, executor, budget) = (self.model.layout.features(), self.name(), self.engine.budget());
         let row = Row { work: work.into(), width, executor, seconds: 0.0, flops, of_sgemm: 0.0, bytes, budget };
-        let turn = Box::new(move || {
+        let once = Box::new(move || {
             let begin = Instant::now();
             once()?;
             Ok(begin.elapsed().as_secs_f64())
         });
-        Work { row, turn }
+        Work { row, once }
     }
 
     fn descent(&self, method: Method, hypotheses: u32, side: u32) -> Result<Descent> {
