@@ -6,7 +6,6 @@
 //! Conventions: OpenCV camera axes (x right, y down, z forward), `world_from_camera`, world z up, lengths in object units
 //! (the object's bounding-box diagonal is 1), colours in [-1, 1].
 
-mod align;
 pub mod camera;
 pub mod confidence;
 mod descent;

@@ -4,7 +4,7 @@ use glam::DMat4;
 use web_time::Instant;
 
 use crate::confidence::{Confidence, Doubt, hidden_doubt, unexplained, unexplained_doubt};
-use crate::estimator::{Effort, Estimate, Options, Progress, Query, at_work, check, estimate, most_rays};
+use crate::estimator::{Effort, Estimate, Options, Progress, Query, at_work, check, estimate};
 use crate::renderer::{View, render_views};
 use crate::unseen::estimate_unseen;
 use crate::{Engine, Error, Model};
@@ -196,7 +196,7 @@ impl Found {
 fn portions<'a>(queries: &'a [Query], options: &Options, most: usize) -> Vec<&'a [Query]> {
     let (mut portions, mut from, mut rays) = (Vec::new(), 0, 0);
     for (number, query) in queries.iter().enumerate() {
-        let own = most_rays(query, options);
+        let own = query.most_rays(options);
         if number > from && rays + own > most {
             portions.push(&queries[from..number]);
             (from, rays) = (number, 0);
@@ -244,7 +244,7 @@ mod tests {
         let queries = [0.9, 0.7, 0.4].map(of);
         let options = &search.tries[0];
         let lengths = |most| portions(&queries, options, most).iter().map(|portion| portion.len()).collect::<Vec<_>>();
-        let one = most_rays(&queries[0], options);
+        let one = queries[0].most_rays(options);
         assert_eq!([0, one, 2 * one, 3 * one].map(lengths), [vec![1, 1, 1], vec![1, 1, 1], vec![2, 1], vec![3]]);
 
         let searched = |at_once| {

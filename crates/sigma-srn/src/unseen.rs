@@ -3,7 +3,7 @@
 
 use glam::DMat4;
 
-use crate::estimator::{Estimate, Options, Phase, Query, Ranked, estimate, weights_of};
+use crate::estimator::{Estimate, Options, Phase, Query, Ranked, estimate};
 use crate::random::stream;
 use crate::trainer::{Train, Trainer, TrainingBatch};
 use crate::{Engine, Error, Model, Rays, pixel_grid};
@@ -85,7 +85,7 @@ fn fit_codes(engine: &Engine, model: Model, query: &Query, poses: &[DMat4], seed
     let mut rays = Rays::default();
     poses.iter().for_each(|pose| rays.push(pose, &query.intrinsics, pixels.iter().copied(), &mut random));
     let (instances, target_rgb) = ((0..poses.len() as u32).collect(), colours.repeat(poses.len()));
-    let batch = TrainingBatch { instances, rays, target_rgb, weights: Some(weights_of(query, 2).repeat(poses.len())) };
+    let batch = TrainingBatch { instances, rays, target_rgb, weights: Some(query.ray_weights(2).repeat(poses.len())) };
     for _ in 0..CODE_STEPS {
         trainer.step(&batch, LEARNING_RATE)?;
     }

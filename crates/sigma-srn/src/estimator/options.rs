@@ -1,0 +1,177 @@
+//! How poses are estimated: phases, and what each is for.
+
+use std::iter::zip;
+
+use crate::descent::{Loss, Method};
+
+/// What steps at every pixel are multiples of, in radians and object units: a sixtieth of a pixel of 64 at most, and a number that sums of it are exact of.
+const GRAIN: f32 = 1.0 / 4096.0;
+
+/// Some steps with the same settings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Phase {
+    /// Steps; none: the poses are only compared with the image.
+    pub steps: u32,
+    /// Every how many pixels, in both directions, a ray is cast; with BFGS only near what the image or the view from a hypothesis's pose at the
+    /// beginning of the phase shows: where both are white nothing is to be seen.
+    pub stride: u32,
+    /// How many hypotheses of each image enter this phase: those with the lowest loss, and of several that have come to the same pose the best
+    /// alone. Where all of them look at the same side of the object, one more: the best of another side, unless its loss is more than twice that of the best.
+    /// `usize::MAX`: all.
+    pub keep: usize,
+    /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`](crate::Query::coverage) is known: see [`Light`](crate::Light). From wrong
+    /// poses the light looks wrong, too.
+    pub light: bool,
+    /// Whether masks are tried dilated and eroded by up to two pixels beside [`Query::dilation`](crate::Query::dilation), where [`Query::coverage`](crate::Query::coverage) is known, with the
+    /// best `keep` hypotheses; later phases compare with the one that leaves the least loss, see [`Estimate::dilation`](crate::Estimate::dilation). Other hypotheses and
+    /// other images wait: none is dropped for it.
+    pub dilate: bool,
+}
+
+/// How poses are estimated.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Options {
+    /// How hypotheses move.
+    pub method: Method,
+    /// Where an image has fewer starts than this, six more are tried around each, turned by 40° about the object: to either side about each
+    /// axis of the camera.
+    pub min_starts: usize,
+    /// Whether starts are moved first, where [`Query::coverage`](crate::Query::coverage) is known: nearer or farther away, and turned about themselves, until the object is as large and
+    /// at the same place in the views from there, as the first phase would show them, as in the image; where a part of it is hidden, or as the whole of it would
+    /// be, whichever has the lower loss. Else their distance and aim are taken for known.
+    pub align: bool,
+    /// Phases, one after the other.
+    pub phases: Vec<Phase>,
+    /// How many times the last phase begins anew, at most, for images whose poses have not arrived: where the second derivatives there promise a loss that
+    /// is lower than the best by more than a hundredth. With BFGS only.
+    pub anew: u32,
+    /// Seed of the initial depths of Adam's rays. With BFGS all begin at the mean depth: random ones change the losses of hypotheses by half a
+    /// thousandth, as much as those of minima side by side differ.
+    pub seed: u64,
+}
+
+/// How hard a search tries.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Effort {
+    /// For poses that are roughly known, and objects that look different from every side.
+    Fast,
+    /// What the figures are measured with.
+    #[default]
+    Normal,
+    /// For what `Normal` has lost.
+    Exhaustive,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Options::of(Effort::Normal)
+    }
+}
+
+impl Options {
+    /// BFGS: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the best few on
+    /// all, until they stand still: the loss has minima side by side. Then once more with new second derivatives: where a valley is flat and
+    /// full of kinks, those that steps have learnt leave a pose a tenth of a degree before its end. These two make up for the light, and before them masks
+    /// are tried dilated. And on so for those that have not arrived: most have, in a number of steps that would be too small for some.
+    pub fn of(effort: Effort) -> Self {
+        let (min_starts, descents) = match effort {
+            Effort::Fast => (84, [(6, 6), (6, 2), (5, 1), (5, 1), (3, 1)]),
+            Effort::Normal => (84, [(8, 16), (8, 6), (6, 1), (16, 3), (6, 3)]),
+            Effort::Exhaustive => (168, [(10, 64), (10, 20), (6, 6), (18, 6), (6, 6)]),
+        };
+        let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, dilate: false }];
+        let phase = |((stride, light, dilate), (steps, keep))| Phase { steps, stride, keep, light, dilate };
+        let kinds = [(4, false, false), (2, false, false), (2, true, true), (1, true, false), (1, true, false)];
+        phases.extend(zip(kinds, descents).map(phase));
+        Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, align: true, phases, anew: 6, seed: 0 }
+    }
+
+    /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
+    pub fn paper() -> Self {
+        let method = Method::Adam { loss: Loss::Mae, learning_rate: 0.1 };
+        Options {
+            method,
+            min_starts: 0,
+            align: false,
+            phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, dilate: false }],
+            anew: 0,
+            seed: 0,
+        }
+    }
+
+    /// The same with `steps` steps in all, none anew, shared between the phases in their present proportions; those that try dilations have as many more or fewer,
+    /// and come on top. Where there are any at all, a phase whose share is none is left out.
+    pub fn with_steps(mut self, steps: u32) -> Self {
+        self.anew = 0;
+        let total = self.phases.iter().filter(|phase| !phase.dilate).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
+        let share = |of: u64| (2 * of * u64::from(steps) + total) / (2 * total);
+        let (mut before, mut done) = (0, 0);
+        self.phases.retain_mut(|phase| {
+            let present = u64::from(phase.steps);
+            if phase.dilate {
+                phase.steps = share(present) as u32;
+            } else {
+                before += present;
+                phase.steps = (share(before) - done) as u32;
+                done = share(before);
+            }
+            phase.steps > 0 || present == 0 || phase.dilate || steps == 0
+        });
+        self
+    }
+
+    /// The same with this stride in every phase.
+    pub fn with_stride(mut self, stride: u32) -> Self {
+        self.phases.iter_mut().for_each(|phase| phase.stride = stride);
+        self
+    }
+
+    /// The same with all starts as they are given, and no others, in every phase.
+    pub fn without_culling(mut self) -> Self {
+        self.align = false;
+        self.min_starts = 0;
+        self.phases.iter_mut().filter(|phase| !phase.dilate).for_each(|phase| phase.keep = usize::MAX);
+        self
+    }
+
+    /// The same, but where all starts would run to the end, only the best 6 do so after a fifth of the steps.
+    pub fn with_culling(mut self) -> Self {
+        let all_to_the_end = self.phases.iter().all(|phase| phase.keep == usize::MAX);
+        if let Some(last) = self.phases.last_mut().filter(|_| all_to_the_end) {
+            let first = Phase { steps: last.steps / 5, ..*last };
+            *last = Phase { steps: last.steps - first.steps, keep: 6, ..*last };
+            self.phases.insert(self.phases.len() - 1, first);
+        }
+        self
+    }
+
+    pub(crate) fn is_gmsd(&self) -> bool {
+        matches!(self.method, Method::Adam { loss: Loss::Gmsd, .. })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_keep_their_proportions() {
+        let default = Options::default();
+        // Pictures without a mask have no others.
+        let all = |options: &Options| options.phases.iter().filter(|phase| !phase.dilate).map(|phase| phase.steps).sum::<u32>();
+        for steps in [0, 1, 7, 250, 1000] {
+            assert_eq!(all(&default.clone().with_steps(steps)), steps);
+        }
+        let total = all(&default);
+        assert_eq!(default.clone().with_steps(total), Options { anew: 0, ..default.clone() });
+        // A look at all starts, dilations, and the phase that has the step.
+        let one: Vec<(u32, u32)> = default.clone().with_steps(1).phases.iter().map(|phase| (phase.steps, phase.stride)).collect();
+        assert_eq!(one, [(0, 4), (0, 2), (1, 1)]);
+        assert_eq!(default.clone().with_steps(0).phases.len(), default.phases.len());
+        let keeps = |options: &Options| options.phases.iter().map(|phase| (phase.steps, phase.keep)).collect::<Vec<_>>();
+        assert_eq!(keeps(&Options::paper().with_culling()), [(60, usize::MAX), (240, 6)]);
+        assert_eq!(default.clone().with_culling(), default);
+        let all_to_the_end = default.with_stride(1).without_culling();
+        assert!(all_to_the_end.phases.iter().all(|phase| phase.stride == 1 && (phase.keep == usize::MAX || phase.dilate)));
+    }
+}

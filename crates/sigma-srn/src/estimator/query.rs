@@ -1,0 +1,180 @@
+//! What is wanted: an image with what is known of it, and where the search for its pose starts.
+
+use std::borrow::Cow;
+
+use glam::{DMat4, DVec2};
+
+use super::align::hidden_side;
+use super::options::{Options, Phase};
+use crate::camera::Intrinsics;
+use crate::mask::{DILATIONS, dilated, has_outline};
+use crate::model::Model;
+use crate::pixel_grid;
+
+/// How far starts are turned that the search adds. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
+const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
+
+/// An image whose camera pose is wanted.
+#[derive(Clone, Debug)]
+pub struct Query {
+    /// Number of the instance that it shows.
+    pub instance: u32,
+    /// Colours in [-1, 1], `[height, width, 3]`, white background.
+    pub rgb: Vec<f32>,
+    /// How much each pixel counts `[height, width]`, from 0, not at all: where something stands before the object, say. `None`: all
+    /// the same. GMSD takes none.
+    pub weights: Option<Vec<f32>>,
+    /// How much of each pixel the object covers `[height, width]`, 0 to 1; the rest of it is white. Where it is known, a phase may make up
+    /// for the light of the image, see [`Phase::light`], and for an outline that is not exact, see [`Phase::dilate`].
+    pub coverage: Option<Vec<f32>>,
+    /// By how many pixels its outline is known to be too far in, or too far out where this is below zero: the search begins with the mask dilated by as
+    /// much. 0 where nothing is known.
+    pub dilation: f64,
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Intrinsics of this image.
+    pub intrinsics: Intrinsics,
+    /// Where the search starts: `world_from_camera`.
+    pub starts: Vec<DMat4>,
+}
+
+impl Query {
+    /// Pixels that have a ray, as columns and rows.
+    pub(crate) fn rays(&self, stride: u32) -> impl Iterator<Item = (u32, u32)> + use<> {
+        pixel_grid(self.width, self.height, stride)
+    }
+
+    /// The same by number.
+    pub(crate) fn pixels(&self, stride: u32) -> impl Iterator<Item = usize> + use<> {
+        let width = self.width;
+        self.rays(stride).map(move |(u, v)| (v * width + u) as usize)
+    }
+
+    fn weight(&self, pixel: usize) -> f32 {
+        self.weights.as_ref().map_or(1.0, |weights| weights[pixel])
+    }
+
+    /// Weights of the rays, scaled to a mean of 1: losses of pictures with masks and without are then of one kind.
+    pub(crate) fn ray_weights(&self, stride: u32) -> Vec<f32> {
+        let weights: Vec<f32> = self.pixels(stride).map(|pixel| self.weight(pixel)).collect();
+        let mean = weights.iter().sum::<f32>() / weights.len() as f32;
+        weights.into_iter().map(|weight| weight / mean).collect()
+    }
+
+    /// Colours, and how much the object covers (none where that is not known), with the mask dilated.
+    pub(crate) fn seen(&self, dilation: f64) -> (Cow<'_, [f32]>, Cow<'_, [f32]>) {
+        match &self.coverage {
+            Some(coverage) if dilation != 0.0 => {
+                let (rgb, coverage) = dilated(&self.rgb, coverage, self.weights.as_deref(), self.width as usize, dilation);
+                (rgb.into(), coverage.into())
+            }
+            coverage => (self.rgb.as_slice().into(), coverage.as_deref().unwrap_or_default().into()),
+        }
+    }
+
+    /// How many of the pixels that count the object covers with its mask dilated.
+    pub(crate) fn area(&self, dilation: f64) -> f64 {
+        let (_, coverage) = self.seen(dilation);
+        coverage.iter().enumerate().map(|(pixel, cover)| f64::from(cover * self.weight(pixel))).sum()
+    }
+
+    /// Whether the mask has an outline that dilations change.
+    pub(crate) fn can_dilate(&self) -> bool {
+        self.coverage.as_ref().is_some_and(|coverage| has_outline(coverage, self.weights.as_deref()))
+    }
+
+    /// On which side something is before the object, see [`hidden_side`].
+    pub(crate) fn hidden_side(&self) -> Option<DVec2> {
+        hidden_side(self.coverage.as_ref()?, self.weights.as_ref()?, self.width as usize)
+    }
+
+    /// The starts, and those that are added.
+    pub(crate) fn all_starts(&self, options: &Options) -> Vec<DMat4> {
+        let around = (self.starts.len() < options.min_starts).then(|| self.starts.iter().flat_map(turned));
+        self.starts.iter().copied().chain(around.into_iter().flatten()).collect()
+    }
+
+    /// How many rays there are in the phase in which there are the most.
+    pub(crate) fn most_rays(&self, options: &Options) -> usize {
+        let starts = self.all_starts(options).len();
+        let rays = |phase: &Phase| {
+            let tried = if phase.dilate { DILATIONS.len() } else { 1 };
+            tried * starts.min(phase.keep) * self.rays(phase.stride).count()
+        };
+        options.phases.iter().map(rays).max().unwrap_or(0)
+    }
+
+    /// Says what is wrong with it.
+    pub(crate) fn check(&self, model: &Model, options: &Options) -> Result<(), String> {
+        let &Query { width, height, .. } = self;
+        let pixels = width as usize * height as usize;
+        if self.rgb.len() != 3 * pixels || self.rgb.is_empty() {
+            return Err(format!("{} values for {width} × {height} pixels of 3", self.rgb.len()));
+        }
+        if self.instance >= model.layout.instances {
+            return Err(format!("instance {}, but the model has {}", self.instance, model.layout.instances));
+        }
+        if self.starts.is_empty() {
+            return Err("no starts".into());
+        }
+        if self.starts.iter().any(|start| !start.is_finite()) {
+            return Err("a start has values that are not finite".into());
+        }
+        if options.phases.iter().any(|phase| self.rays(phase.stride).next().is_none()) {
+            return Err(format!("a stride larger than {width} × {height} pixels"));
+        }
+        if self.coverage.as_ref().is_some_and(|c| c.len() != pixels || c.iter().any(|cover| !(0.0..=1.0).contains(cover))) {
+            return Err(format!("needs a coverage of {pixels} values from 0 to 1"));
+        }
+        let side = f64::from(width.max(height));
+        if self.dilation.is_nan() || self.dilation.abs() > side {
+            return Err(format!("a mask dilated by {} pixels, where the image has {side}", self.dilation));
+        }
+        if let Some(weights) = &self.weights {
+            if weights.len() != pixels || weights.iter().any(|weight| !(0.0..f32::INFINITY).contains(weight)) {
+                return Err(format!("needs {pixels} weights of 0 or more, finite"));
+            }
+            if options.phases.iter().any(|phase| self.ray_weights(phase.stride).iter().any(|weight| !weight.is_finite())) {
+                return Err("too few pixels count: a phase of the search sees none of them".into());
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A camera turned about the object by 40°, to either side about each of its axes.
+pub(super) fn turned(world_from_camera: &DMat4) -> impl Iterator<Item = DMat4> {
+    let axes = [world_from_camera.x_axis, world_from_camera.y_axis, world_from_camera.z_axis];
+    let turns =
+        axes.into_iter().flat_map(|axis| [-TURN, TURN].map(|angle| DMat4::from_axis_angle(axis.truncate().normalize(), angle)));
+    turns.map(|turn| turn * *world_from_camera)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn added_starts_are_40_degrees_away_on_the_same_sphere() {
+        let start = crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
+        let added: Vec<DMat4> = turned(&start).collect();
+        assert_eq!(added.len(), 6);
+        for (k, pose) in added.iter().enumerate() {
+            let (degrees, _) = crate::camera::pose_error(pose, &start);
+            let [near, far] = [&start, pose].map(|pose| pose.w_axis.truncate().length());
+            assert!((degrees - 40.0).abs() < 1e-6 && (near - far).abs() < 1e-12, "{k}: {degrees}°");
+            assert!(added[..k].iter().all(|other| crate::camera::pose_error(pose, other).0 > 40.0), "{k}");
+        }
+    }
+
+    #[test]
+    fn no_added_start_is_the_pose_that_others_were_turned_away_from() {
+        let truth = crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
+        for start in crate::camera::neighbor4(&truth).iter().flat_map(turned) {
+            let (degrees, _) = crate::camera::pose_error(&start, &truth);
+            assert!(degrees > 5.0, "{degrees}°");
+        }
+    }
+}

@@ -1,0 +1,156 @@
+//! What hypotheses are compared with in a phase: rays, and the colours that are wanted of them.
+
+use std::iter::zip;
+
+use glam::DMat4;
+
+use super::Hypothesis;
+use super::options::{Options, Phase};
+use super::query::Query;
+use crate::camera::Pose6;
+use crate::descent::{Descent, Method, Shape};
+use crate::engine::Engine;
+use crate::light::Light;
+use crate::model::Model;
+use crate::random::{MEAN_DEPTH, stream};
+use crate::region::region;
+use crate::{Error, Rays};
+
+/// What the hypotheses of a phase are compared with; those of a query come one after the other, the best first.
+pub(super) struct Targets {
+    shape: Shape,
+    /// The instances, and which of them each hypothesis shows.
+    instances: Vec<u32>,
+    slots: Vec<u32>,
+    rays: Rays,
+    /// `[hypotheses, rays, 3]`.
+    pub rgb: Vec<f32>,
+    /// `[hypotheses, rays]`, none where all rays count the same.
+    weights: Option<Vec<f32>>,
+}
+
+impl Targets {
+    /// On the whole grid of a phase.
+    pub fn new(queries: &[Query], options: &Options, phase: &Phase, running: &[Hypothesis]) -> Self {
+        let mut instances: Vec<u32> = running.iter().map(|h| queries[h.query].instance).collect();
+        instances.sort_unstable();
+        instances.dedup();
+        let mut random = stream(options.seed, 0);
+        let (mut slots, mut rays, mut rgb, mut weights) = (Vec::new(), Rays::default(), Vec::new(), Vec::new());
+        for hypothesis in running {
+            let query = &queries[hypothesis.query];
+            slots.push(instances.binary_search(&query.instance).expect("collected above") as u32);
+            rays.push(&DMat4::IDENTITY, &query.intrinsics, query.rays(phase.stride), &mut random);
+            let (colours, _) = query.seen(hypothesis.dilation);
+            query.pixels(phase.stride).for_each(|pixel| rgb.extend_from_slice(&colours[3 * pixel..][..3]));
+            weights.extend(query.ray_weights(phase.stride));
+        }
+        if matches!(options.method, Method::Bfgs { .. }) {
+            rays.z0.fill(MEAN_DEPTH);
+        }
+        let across = |size: u32| (phase.stride / 2..size).step_by(phase.stride as usize).count() as u32;
+        let shape = Shape {
+            hypotheses: running.len() as u32,
+            width: across(queries[0].width),
+            height: across(queries[0].height),
+            instances: instances.len() as u32,
+        };
+        let weights = queries.iter().any(|query| query.weights.is_some()).then_some(weights);
+        Targets { shape, instances, slots, rays, rgb, weights }
+    }
+
+    pub fn rays_per_image(&self) -> usize {
+        (self.shape.width * self.shape.height) as usize
+    }
+
+    /// Makes up for the light of the image of each query, where its coverage is known: that between it and the view from the best pose.
+    fn undo_lights(&mut self, queries: &[Query], stride: u32, running: &[Hypothesis], renders: &[f32]) -> Vec<Option<Light>> {
+        let mut lights = vec![None; queries.len()];
+        let values = 3 * self.rays_per_image();
+        for ((hypothesis, render), rgb) in zip(running, renders.chunks(values)).zip(self.rgb.chunks_mut(values)) {
+            let query = &queries[hypothesis.query];
+            let (_, coverage) = query.seen(hypothesis.dilation);
+            if query.coverage.is_some() {
+                let coverage: Vec<f32> = query.pixels(stride).map(|pixel| coverage[pixel]).collect();
+                let between = || Light::between(rgb, render, &coverage, &query.ray_weights(stride));
+                lights[hypothesis.query].get_or_insert_with(between).undo(rgb, &coverage);
+            }
+        }
+        lights
+    }
+
+    /// The same on the rays alone that are worth their time, see [`region`]; losses stay means over the whole grid. `None` if that is all of them, or none.
+    fn in_regions(&self, renders: &[f32]) -> Option<Self> {
+        let all = self.rays_per_image();
+        let weights = self.weights.clone().unwrap_or_else(|| vec![1.0; self.rgb.len() / 3]);
+        let each = zip(self.rgb.chunks(3 * all), renders.chunks(3 * all)).zip(weights.chunks(all));
+        let regions: Vec<Vec<usize>> =
+            each.map(|((rgb, render), weights)| region(rgb, render, weights, self.shape.width as usize)).collect();
+        let most = regions.iter().map(Vec::len).max()?;
+        if most == all || regions.iter().any(Vec::is_empty) {
+            return None;
+        }
+        let (mut uv, mut z0, mut rgb, mut counts) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        for (hypothesis, region) in regions.iter().enumerate() {
+            // Hypotheses have as many rays each: some of a small region are there more than once, and count once.
+            for (number, ray) in region.iter().cycle().take(most).enumerate() {
+                let ray = hypothesis * all + ray;
+                uv.extend_from_slice(&self.rays.uv[2 * ray..][..2]);
+                z0.push(self.rays.z0[ray]);
+                rgb.extend_from_slice(&self.rgb[3 * ray..][..3]);
+                counts.push(if number < region.len() { weights[ray] * most as f32 / all as f32 } else { 0.0 });
+            }
+        }
+        let (instances, slots, intrinsics) = (self.instances.clone(), self.slots.clone(), self.rays.intrinsics.clone());
+        let rays = Rays { world_from_camera: self.rays.world_from_camera.clone(), intrinsics, uv, z0 };
+        let shape = Shape { width: most as u32, height: 1, ..self.shape };
+        Some(Targets { shape, instances, slots, rays, rgb, weights: Some(counts) })
+    }
+
+    /// At the hypotheses' poses; from there they move, or are only compared.
+    pub fn descent(
+        &self,
+        engine: &Engine,
+        model: &Model,
+        method: Method,
+        is_moving: bool,
+        running: &[Hypothesis],
+    ) -> Result<Descent, Error> {
+        let new = if is_moving { Descent::new } else { Descent::still };
+        let mut descent = new(engine, model, self.shape, method)?;
+        descent.set_targets(&self.instances, &self.slots, &self.rays, &self.rgb, self.weights.as_deref())?;
+        let poses: Vec<Pose6> = running.iter().map(|h| h.pose).collect();
+        descent.set_poses(&poses)?;
+        Ok(descent)
+    }
+}
+
+/// The descent of a phase, whose poses move or are only compared, and the light of each query that it makes up for.
+pub(super) fn prepare(
+    engine: &Engine,
+    model: &Model,
+    queries: &[Query],
+    options: &Options,
+    phase: &Phase,
+    is_moving: bool,
+    running: &[Hypothesis],
+) -> Result<(Descent, Vec<Option<Light>>), Error> {
+    let mut targets = Targets::new(queries, options, phase, running);
+    let method = options.method.with_stride(phase.stride);
+    let mut lights = vec![None; queries.len()];
+    let makes_up = phase.light && queries.iter().any(|query| query.coverage.is_some());
+    // The paper's way compares whole images.
+    let looks_closer = phase.steps > 0 && matches!(method, Method::Bfgs { .. });
+    if makes_up || looks_closer {
+        let mut views = targets.descent(engine, model, method, false, running)?;
+        views.compare()?;
+        let renders = views.rgb()?;
+        if makes_up {
+            lights = targets.undo_lights(queries, phase.stride, running, &renders);
+        }
+        if looks_closer {
+            targets = targets.in_regions(&renders).unwrap_or(targets);
+        }
+    }
+    Ok((targets.descent(engine, model, method, is_moving, running)?, lights))
+}
