@@ -2,8 +2,21 @@
 
 use crate::error::{At, Error, Result, read_bytes};
 use image::error::DecodingError;
-use image::{ImageFormat, RgbImage};
-use std::path::Path;
+use image::{DynamicImage, ImageFormat, RgbImage};
+use std::path::{Path, PathBuf};
+
+/// How names of pictures end that are read, in lower case. What they are is told by their first bytes.
+pub const ENDINGS: [&str; 7] = ["png", "jpg", "jpeg", "bmp", "tif", "tiff", "webp"];
+
+/// Whether the name of a file ends like that of a picture.
+pub fn is_picture(path: &Path) -> bool {
+    path.extension().is_some_and(|ending| ENDINGS.iter().any(|known| ending.eq_ignore_ascii_case(known)))
+}
+
+/// The picture without its ending, if there is one with any of them.
+pub(crate) fn with_ending(path: &Path) -> Option<PathBuf> {
+    ENDINGS.map(|ending| PathBuf::from(format!("{}.{ending}", path.display()))).into_iter().find(|path| path.is_file())
+}
 
 /// A float image: `data` is row-major `[height · width, 3]`.
 #[derive(Debug, Clone, PartialEq)]
@@ -69,14 +82,23 @@ impl Pixels {
 }
 
 /// Reads an image file, all of it.
-pub(crate) fn decode(path: &Path) -> Result<image::DynamicImage> {
+pub(crate) fn decode(path: &Path) -> Result<DynamicImage> {
     let bytes = read_bytes(path)?;
     let reader = image::ImageReader::new(std::io::Cursor::new(&bytes)).with_guessed_format().at(path)?;
     if reader.format() == Some(ImageFormat::Jpeg) && ends_early(&bytes) {
         let source = DecodingError::new(ImageFormat::Jpeg.into(), "the picture ends early");
         return Err(Error::Image { path: path.into(), source: image::ImageError::Decoding(source) });
     }
-    reader.decode().at(path)
+    let picture = reader.decode().at(path)?;
+    let floats: &[f32] = match &picture {
+        DynamicImage::ImageRgb32F(picture) => picture,
+        DynamicImage::ImageRgba32F(picture) => picture,
+        _ => &[],
+    };
+    match floats.iter().find(|value| !(0.0..=1.0).contains(*value)) {
+        Some(value) => Err(Error::field(path, "pixels", "values from 0 to 1", value)),
+        None => Ok(picture),
+    }
 }
 
 /// Whether a JPEG has no end: the decoder would make up what is missing, in grey. Looked for from segment to segment, since a
@@ -182,9 +204,40 @@ mod tests {
     }
 
     #[test]
+    fn pictures_are_read_whatever_their_format() {
+        let dir = tempfile::tempdir().unwrap();
+        let drawn = RgbImage::from_fn(16, 8, |x, y| image::Rgb([(16 * x) as u8, (32 * y) as u8, 90]));
+        for ending in ENDINGS {
+            let path = dir.path().join("frame").with_extension(ending.to_uppercase());
+            drawn.save(&path).unwrap();
+            let read = Pixels::open(&path).unwrap().to_rgb8();
+            let most = read.iter().zip(drawn.iter()).map(|(a, b)| a.abs_diff(*b)).max();
+            let is_lossy = ["jpg", "jpeg"].contains(&ending);
+            assert!(most <= Some(if is_lossy { 40 } else { 0 }) && is_picture(&path), "{ending}: {most:?}");
+        }
+        assert!(!is_picture(Path::new("png")) && !is_picture(Path::new("pose.txt")));
+        let named = |name: &str| with_ending(&dir.path().join(name));
+        std::fs::write(dir.path().join("v1.2.webp"), "").unwrap();
+        assert_eq!([named("v1.2"), named("v1")], [Some(dir.path().join("v1.2.webp")), None]);
+    }
+
+    #[test]
+    fn values_that_are_no_shares_of_white_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("linear.tiff");
+        let read = |white: f32| {
+            DynamicImage::from(image::Rgb32FImage::from_pixel(2, 2, image::Rgb([0.0, 0.5, white]))).save(&path).unwrap();
+            Pixels::open(&path).map(|read| read.data[..3].to_vec()).map_err(|error| error.to_string())
+        };
+        assert_eq!(read(1.0).unwrap(), [-1.0, 0.0, 1.0]);
+        let errors = [255.0, f32::NAN].map(|white| read(white).unwrap_err());
+        assert!(errors.iter().all(|error| error.contains("linear.tiff") && error.contains("from 0 to 1")), "{errors:?}");
+    }
+
+    #[test]
     fn every_colour_type_is_read_and_transparency_is_white() {
         let dir = tempfile::tempdir().unwrap();
-        let cases: [(&str, image::DynamicImage, [f32; 3]); 3] = [
+        let cases: [(&str, DynamicImage, [f32; 3]); 3] = [
             ("grey", image::GrayImage::from_pixel(2, 2, image::Luma([51])).into(), [-0.6; 3]),
             ("deep", image::ImageBuffer::from_pixel(2, 2, image::Rgb([0u16, 65535, 13107])).into(), [-1.0, 1.0, -0.6]),
             ("alpha", image::RgbaImage::from_pixel(2, 2, image::Rgba([0, 0, 255, 51])).into(), [0.6, 0.6, 1.0]),

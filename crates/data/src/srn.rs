@@ -8,7 +8,7 @@
 
 use crate::camera::rigid_error;
 use crate::error::{At, Error, Result, read_text};
-use crate::pixels::Pixels;
+use crate::pixels::{Pixels, is_picture};
 use glam::DMat4;
 use image::metadata::Orientation;
 use image::{ImageDecoder, RgbImage};
@@ -128,15 +128,16 @@ impl SrnSet {
 impl InstanceFiles {
     fn open(dir: PathBuf) -> Result<Self> {
         let mut views = BTreeMap::<String, [Option<PathBuf>; 2]>::new();
-        for (slot, (folder, extensions)) in [("rgb", &["png", "jpg", "jpeg"][..]), ("pose", &["txt"])].into_iter().enumerate() {
+        let is_pose = |path: &Path| path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("txt"));
+        for (slot, folder) in ["rgb", "pose"].into_iter().enumerate() {
             let folder = dir.join(folder);
             for entry in std::fs::read_dir(&folder).at(&folder)? {
                 let entry = entry.at(&folder)?;
                 let path = entry.path();
                 // macOS leaves `._NAME.png` beside pictures, which is none.
                 let is_hidden = entry.file_name().to_string_lossy().starts_with('.');
-                let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-                if extensions.contains(&extension.as_str()) && !is_hidden && !entry.file_type().at(&path)?.is_dir() {
+                let is_one = if slot == 0 { is_picture(&path) } else { is_pose(&path) };
+                if is_one && !is_hidden && !entry.file_type().at(&path)?.is_dir() {
                     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
                     views.entry(name).or_default()[slot] = Some(path);
                 }

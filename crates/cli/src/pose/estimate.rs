@@ -19,7 +19,7 @@ use crate::common::{EngineArgs, Result, create_dir, load_model, print, progress,
 /// Flags of `sigma-pose estimate`.
 #[derive(Args, Debug)]
 pub struct Estimate {
-    /// Pictures (PNG, JPEG) of any size and colour type; transparency becomes white. A photograph that lies in no SRN folder is cut to a square
+    /// Pictures (PNG, JPEG, BMP, TIFF, WebP) of any size and colour type; transparency becomes white. A photograph that lies in no SRN folder is cut to a square
     /// around what transparency, --cutout and --mask leave of it; with neither, to its middle. Several are searched for side by side.
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,

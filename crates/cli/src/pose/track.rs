@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Tracked, Tracker};
+use srn_data::pixels::{ENDINGS, is_picture};
 
 use super::draw;
 use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side, warn_of_turned};
@@ -201,16 +202,12 @@ fn pictures_in(dir: &Path) -> Result<Vec<PathBuf>> {
     let files = std::fs::read_dir(dir).map_err(|error| format!("{}: {error}", dir.display()))?;
     let mut frames = files.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
     let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let is_picture = |path: &PathBuf| {
-        let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-        // macOS leaves `._NAME.png` beside pictures, which is none.
-        ["png", "jpg", "jpeg"].contains(&ending.as_str()) && !name(path).starts_with('.')
-    };
-    frames.retain(is_picture);
+    // macOS leaves `._NAME.png` beside pictures, which is none.
+    frames.retain(|path| is_picture(path) && !name(path).starts_with('.'));
     let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     frames.sort_by_cached_key(|path| (numbered(&stem(path)), path.clone()));
     if frames.is_empty() {
-        return Err(format!("{}: no pictures (.png, .jpg) in it", dir.display()).into());
+        return Err(format!("{}: no pictures (.{}) in it", dir.display(), ENDINGS.join(", .")).into());
     }
     Ok(frames)
 }
@@ -268,7 +265,7 @@ mod tests {
             "frame10.png",
             "frame9.JPG",
             "frame.png",
-            "b2.jpeg",
+            "b2.tif",
             "frame009.png",
             "._frame1.png",
             "notes.txt",
@@ -278,6 +275,6 @@ mod tests {
         names.iter().for_each(|name| std::fs::write(dir.path().join(name), "").unwrap());
         let found = pictures_in(dir.path()).unwrap();
         let found: Vec<_> = found.iter().map(|path| path.file_name().unwrap().to_str().unwrap()).collect();
-        assert_eq!(found, ["b2.jpeg", "b10.png", "b10x1.png", "frame.png", "frame009.png", "frame9.JPG", "frame10.png"]);
+        assert_eq!(found, ["b2.tif", "b10.png", "b10x1.png", "frame.png", "frame009.png", "frame9.JPG", "frame10.png"]);
     }
 }

@@ -6,6 +6,7 @@
 use super::{Collector, Format, ReadOptions, View, WriteOptions, Written, copy_mask, copy_picture, from_json};
 use crate::capture::{Bounds, Capture};
 use crate::error::{At, Error, Result, read_text};
+use crate::pixels::with_ending;
 use glam::{DMat3, DMat4, DVec3};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -135,10 +136,7 @@ fn read_scene(dir: &Path, options: &ReadOptions) -> Result<Vec<Capture>> {
                     found.skip(Error::field(&cameras_file, format!("image {image}"), "a camera", "none"));
                     continue;
                 };
-                let of_image = |folder: &str, name: String| {
-                    let endings = ["png", "jpg", "jpeg"].map(|ending| dir.join(folder).join(format!("{name}.{ending}")));
-                    endings.into_iter().find(|path| path.is_file())
-                };
+                let of_image = |folder: &str, name: String| with_ending(&dir.join(folder).join(name));
                 let missing = || dir.join("rgb").join(format!("{image:06}.png"));
                 let mask = |folder| of_image(folder, format!("{image:06}_{k:06}"));
                 let rotation = DMat3::from_cols_array(&pose.cam_R_m2c).transpose();

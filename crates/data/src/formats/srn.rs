@@ -5,7 +5,7 @@ use crate::camera::{Axes, Camera, unit_sphere_seen_from};
 use crate::capture::{Capture, Frame, FrameRecord};
 use crate::error::{Error, Result, read_text};
 use crate::picture::{Picture, cut};
-use crate::pixels::decode;
+use crate::pixels::{decode, is_picture};
 use crate::srn::{InstanceFiles, InstanceWriter, Intrinsics, SrnSet, picture_size, read_pose_unchecked, write_png};
 use glam::DVec2;
 use std::path::{Path, PathBuf};
@@ -123,9 +123,7 @@ fn write_picture(
 ) -> Result<Option<Camera>> {
     let camera = frame.camera.with_pixel_centre(0.0);
     let folder = dir.join("rgb");
-    let extension = frame.image.extension().unwrap_or_default();
-    let readable = ["png", "jpg", "jpeg"].iter().any(|known| extension.eq_ignore_ascii_case(known));
-    if options.side.is_none() && frame.mask.is_none() && camera.is_pinhole() && readable {
+    if options.side.is_none() && frame.mask.is_none() && camera.is_pinhole() && is_picture(&frame.image) {
         decode(&frame.image)?;
         return super::copy_picture(frame, &folder, &frame.name, false).map(|_| Some(camera));
     }

@@ -5,6 +5,7 @@ use super::{Collector, Format, ReadOptions, View, WriteOptions, Written, copy_ma
 use crate::camera::{Axes, Camera};
 use crate::capture::Capture;
 use crate::error::{Error, Result, read_text};
+use crate::pixels::with_ending;
 use glam::{DMat4, DVec4};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -110,8 +111,7 @@ pub fn read(path: &Path, options: &ReadOptions) -> Result<Capture> {
 /// The picture of a frame; NeRF's own sets leave the ending out.
 fn picture(folder: &Path, file_path: &str) -> PathBuf {
     let path = folder.join(file_path.replace('\\', "/"));
-    let endings = ["png", "jpg", "jpeg"].map(|ending| PathBuf::from(format!("{}.{ending}", path.display())));
-    if path.is_file() { path } else { endings.into_iter().find(|path| path.is_file()).unwrap_or(path) }
+    if path.is_file() { path } else { with_ending(&path).unwrap_or(path) }
 }
 
 /// Three or four rows of four.

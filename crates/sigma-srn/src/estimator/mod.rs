@@ -128,7 +128,6 @@ pub fn estimate(
     observe: impl FnMut(Progress) -> Result<(), Error>,
 ) -> Result<Vec<Estimate>, Error> {
     check(model, queries, options)?;
-    check(model, queries, options)?;
     let (model, queries) = at_work(model, queries)?;
     let (model, queries) = (&*model, &*queries);
     let mut hypotheses = Vec::new();
