@@ -368,6 +368,28 @@ fn records_are_written_once() {
     assert_eq!(lines.matches("DO NOT TRUST").count(), 2);
 }
 
+/// Of more pictures than are searched for side by side, each has its own line, instance, truth and record.
+#[test]
+fn many_pictures_come_one_after_the_other() {
+    let home = home();
+    let pictures: Vec<String> =
+        (0..34).map(|k| format!("DATA/{}/rgb/{:06}.png", if k % 2 == 0 { "seat" } else { "bucket" }, k / 2)).collect();
+    let args = "--model model.safetensors --executor cpu --starts fixed24 --no-cull --stride 4 --accept 1e9";
+    let one = |k: usize, more: &str| run(home.path(), &format!("estimate {} {args} {more}", pictures[k]), 0);
+    let text = run(home.path(), &format!("estimate {} {args} --steps 2 --truth auto --record out", pictures.join(" ")), 0);
+    let (lines, began): (Vec<&str>, Vec<&str>) = text.lines().map(|line| (line, &line[..line.find("  loss").unwrap()])).unzip();
+    assert_eq!(lines.len(), 34);
+    for k in [0, 31, 32, 33] {
+        let alone = one(k, "--steps 2 --truth auto");
+        assert!(alone.starts_with(began[k]), "{k}: {}\n{alone}", lines[k]);
+        assert_eq!(alone.split("  error ").nth(1), Some(&*format!("{}\n", lines[k].split("  error ").nth(1).unwrap())), "{k}");
+    }
+    assert_eq!(files(&home.path().join("out")).len(), 3 * 34);
+    one(33, "--steps 2 --truth auto --record alone");
+    let page = |dir: &str| image::open(home.path().join(dir).join("bucket-000016.png")).unwrap();
+    assert_eq!(page("out"), page("alone"));
+}
+
 #[test]
 fn a_photo_needs_to_be_explained() {
     let home = home();

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use glam::DMat4;
+use indicatif::ProgressBar;
 use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Light, Model, Pose6};
 use srn_data::camera::Axes;
@@ -16,11 +17,14 @@ use super::record::Log;
 use super::search::{On, PoseError, SearchArgs, Starts, deviation, run as search};
 use crate::common::{EngineArgs, Result, create_dir, load_model, print, progress, refuse_existing, refuse_to_write};
 
+/// Pictures that are searched for side by side, enough to fill a large GPU. What was found of them is printed before the next ones are looked at.
+const AT_ONCE: usize = 32;
+
 /// Flags of `sigma-pose estimate`.
 #[derive(Args, Debug)]
 pub struct Estimate {
     /// Pictures (PNG, JPEG, BMP, TIFF, WebP) of any size and colour type; transparency becomes white. A photograph that lies in no SRN folder is cut to a square
-    /// around what transparency, --cutout and --mask leave of it; with neither, to its middle. Several are searched for side by side.
+    /// around what transparency, --cutout and --mask leave of it; with neither, to its middle. Several are searched for side by side, 32 at a time.
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
     #[command(flatten)]
@@ -164,43 +168,54 @@ pub fn run(args: &Estimate) -> Result<bool> {
     }
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
+    let mut output = Output { args, on, notation: &notation, pictures: &pictures, sources: &sources, images: vec![] };
     if args.unseen {
-        let found = unseen(args, on, &pictures, &starts)?;
-        let names = vec!["unseen".to_string(); pictures.len()];
-        report(args, on, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
-        return Ok(found.iter().all(Found::is_trusted));
+        unseen(&starts, &mut output)?;
+    } else {
+        searched(&starts, &mut output)?;
     }
+    output.end()
+}
 
+/// Poses of pictures of objects in the model.
+fn searched(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
+    let &mut Output { args, on, pictures, .. } = output;
+    let settings = args.search.search()?;
     let bar = progress(0, "steps");
-    let mut log = Log::default();
-    let found = search(&args.search.search()?, on, &pictures, &starts, |mut progress| {
-        bar.set_length(progress.steps.into());
-        if progress.search > 0 && progress.step == 0 {
-            bar.set_message(format!("{}, once more", pictures[progress.hypotheses[0].0].name));
-        }
-        bar.set_position(progress.step.into());
-        if args.record.is_some() { log.note(&mut progress) } else { Ok(()) }
-    })?;
-    bar.finish_and_clear();
-
-    let names: Vec<String> = pictures.iter().map(|picture| model.instance_name(picture.instance)).collect();
-    report(args, on, &names, &pictures, &found, &sources).print(args, &found, &notation)?;
-    if let Some(dir) = &args.record {
+    let (mut left, mut before) = (pictures.len().div_ceil(AT_ONCE) as u64, 0);
+    for (pictures, starts) in pictures.chunks(AT_ONCE).zip(starts.chunks(AT_ONCE)) {
+        let (first, mut log) = (output.images.len(), Log::default());
+        let found = search(&settings, on, pictures, starts, |mut progress| {
+            bar.set_length(before + left * u64::from(progress.steps));
+            if progress.search > 0 && progress.step == 0 {
+                bar.set_message(format!("{}, once more", pictures[progress.hypotheses[0].0].name));
+            }
+            bar.set_position(before + u64::from(progress.step));
+            if args.record.is_some() { log.note(&mut progress) } else { Ok(()) }
+        })?;
+        (left, before) = (left - 1, bar.position());
+        bar.set_message("");
         for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
-            log.write(dir, i, picture, found, on)?;
-            outline::write(dir, &args.images[i], picture, found, on)?;
+            output.add(on.model.instance_name(picture.instance), found, &bar)?;
+            if let Some(dir) = &args.record {
+                log.write(dir, i, picture, found, on)?;
+                outline::write(dir, &args.images[first + i], picture, found, on)?;
+            }
         }
+    }
+    bar.finish_and_clear();
+    if let Some(dir) = &args.record {
         eprintln!("pictures in {}", dir.display());
     }
-    if args.cutout.is_empty() && found.iter().any(|found| found.doubt == Some(Doubt::Hidden)) {
+    if args.cutout.is_empty() && output.images.iter().any(|image| image.doubt == Some(Doubt::Hidden)) {
         eprintln!("--mask says nothing of what it hides; a segmentation of the object is for --cutout, and its outline counts");
     }
-    Ok(found.iter().all(Found::is_trusted))
+    Ok(())
 }
 
 /// Poses of objects that are not in the model.
-fn unseen(args: &Estimate, on: On, pictures: &[Picture], starts: &[Vec<DMat4>]) -> Result<Vec<Found>> {
-    let mut found = Vec::new();
+fn unseen(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
+    let &mut Output { args, on, pictures, .. } = output;
     let bar = progress(0, "turns");
     for (number, (picture, starts)) in pictures.iter().zip(starts).enumerate() {
         let observe = |turn: usize, turns: usize| {
@@ -208,14 +223,14 @@ fn unseen(args: &Estimate, on: On, pictures: &[Picture], starts: &[Vec<DMat4>]) 
             bar.set_position((turns * number + turn) as u64);
             Ok(())
         };
-        let (one, fitted) = args.search.run_unseen(on, picture, starts, observe)?;
+        let (found, fitted) = args.search.run_unseen(on, picture, starts, observe)?;
         if let Some(path) = &args.save_model {
             fitted.save(path)?;
         }
-        found.push(one);
+        output.add("unseen".into(), &found, &bar)?;
     }
     bar.finish_and_clear();
-    Ok(found)
+    Ok(())
 }
 
 /// One of `things` per image, of which there are none, one or as many.
@@ -251,19 +266,48 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
     Ok(pictures)
 }
 
-fn report(
-    args: &Estimate,
-    On { engine, side, .. }: On,
-    names: &[String],
-    pictures: &[Picture],
-    found: &[Found],
-    sources: &[Option<Notation>],
-) -> Report {
-    let convention = args.poses.convention;
-    let image = |(k, found): (usize, &Found)| {
+/// What was found so far.
+struct Output<'a> {
+    args: &'a Estimate,
+    on: On<'a>,
+    notation: &'a Notation,
+    pictures: &'a [Picture],
+    sources: &'a [Option<Notation>],
+    images: Vec<ImageReport>,
+}
+
+impl Output<'_> {
+    /// Takes what was found of the next picture, and prints it, unless all is to be one JSON document.
+    fn add(&mut self, instance: String, found: &Found, bar: &ProgressBar) -> Result<()> {
+        let image = self.image(instance, found);
+        if !self.args.json {
+            bar.suspend(|| print(&image.line(found, self.notation)))?;
+        }
+        self.images.push(image);
+        Ok(())
+    }
+
+    /// Prints the document, if there is to be one; whether all poses are to be trusted.
+    fn end(self) -> Result<bool> {
+        let is_trusted = self.images.iter().all(|image| image.trusted);
+        if self.args.json {
+            let report = Report {
+                executor: self.on.engine.to_string(),
+                seconds: self.images.iter().map(|image| image.seconds).sum(),
+                convention: self.args.poses.convention,
+                images: self.images,
+            };
+            print(&serde_json::to_string_pretty(&report)?)?;
+        }
+        Ok(is_trusted)
+    }
+
+    fn image(&self, instance: String, found: &Found) -> ImageReport {
+        let (k, convention) = (self.images.len(), self.args.poses.convention);
+        let picture = &self.pictures[k];
         let world_from_camera = convention.of_ours(found.world_from_camera);
         let [a, b, c, x, y, z] = Pose6::from_matrix(&world_from_camera).0;
-        let error = |pose: &DMat4| pictures[k].truth.map(|truth| PoseError::of(pose, &truth));
+        let error = |pose: &DMat4| picture.truth.map(|truth| PoseError::of(pose, &truth));
         let ranked = |r: &sigma_srn::Ranked| RankedReport {
             start: r.start,
             loss: r.loss,
@@ -276,10 +320,10 @@ fn report(
             world_from_camera: convention.of_ours(r.pose.to_matrix()).transpose().to_cols_array_2d(),
         };
         ImageReport {
-            image: args.images[k].clone(),
-            instance: names[k].clone(),
+            image: self.args.images[k].clone(),
+            instance,
             world_from_camera: world_from_camera.transpose().to_cols_array_2d(),
-            source_from_camera: sources[k].map(|source| source.rows(&found.world_from_camera)),
+            source_from_camera: self.sources[k].map(|source| source.rows(&found.world_from_camera)),
             euler_rad: [a, b, c],
             translation: [x, y, z],
             loss: found.estimate.loss,
@@ -288,7 +332,7 @@ fn report(
             doubt: found.doubt,
             confidence: found.confidence,
             light: found.estimate.light,
-            mask_dilation_px: found.estimate.dilation.map(|by| by * pictures[k].pixels_on_disk(side)),
+            mask_dilation_px: found.estimate.dilation.map(|by| by * picture.pixels_on_disk(self.on.side)),
             rival: found.estimate.rival().map(rival),
             searches: found.searches,
             start: found.estimate.ranking[0].start,
@@ -296,21 +340,6 @@ fn report(
             ranking: found.estimate.ranking.iter().map(ranked).collect(),
             seconds: found.seconds,
         }
-    };
-    Report {
-        executor: engine.to_string(),
-        seconds: found.iter().map(|found| found.seconds).sum(),
-        convention,
-        images: found.iter().enumerate().map(image).collect(),
-    }
-}
-
-impl Report {
-    fn print(&self, args: &Estimate, found: &[Found], notation: &Notation) -> Result<()> {
-        if args.json {
-            return print(&serde_json::to_string_pretty(self)?);
-        }
-        self.images.iter().zip(found).try_for_each(|(image, found)| print(&image.line(found, notation)))
     }
 }
 
