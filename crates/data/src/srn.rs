@@ -128,16 +128,16 @@ impl SrnSet {
 impl InstanceFiles {
     fn open(dir: PathBuf) -> Result<Self> {
         let mut views = BTreeMap::<String, [Option<PathBuf>; 2]>::new();
-        let is_pose = |path: &Path| path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("txt"));
-        for (slot, folder) in ["rgb", "pose"].into_iter().enumerate() {
+        let is_text = |path: &Path| path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("txt"));
+        let kinds: [(&str, fn(&Path) -> bool); 2] = [("rgb", is_picture), ("pose", is_text)];
+        for (slot, (folder, is_one)) in kinds.into_iter().enumerate() {
             let folder = dir.join(folder);
             for entry in std::fs::read_dir(&folder).at(&folder)? {
                 let entry = entry.at(&folder)?;
                 let path = entry.path();
                 // macOS leaves `._NAME.png` beside pictures, which is none.
                 let is_hidden = entry.file_name().to_string_lossy().starts_with('.');
-                let is_one = if slot == 0 { is_picture(&path) } else { is_pose(&path) };
-                if is_one && !is_hidden && !entry.file_type().at(&path)?.is_dir() {
+                if is_one(&path) && !is_hidden && !entry.file_type().at(&path)?.is_dir() {
                     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
                     views.entry(name).or_default()[slot] = Some(path);
                 }
