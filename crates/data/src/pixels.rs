@@ -10,7 +10,12 @@ pub const ENDINGS: [&str; 7] = ["png", "jpg", "jpeg", "bmp", "tif", "tiff", "web
 
 /// Whether the name of a file ends like that of a picture.
 pub fn is_picture(path: &Path) -> bool {
-    path.extension().is_some_and(|ending| ENDINGS.iter().any(|known| ending.eq_ignore_ascii_case(known)))
+    ends_like(path, &ENDINGS)
+}
+
+/// Whether the name of a file has one of these endings, in any case.
+pub(crate) fn ends_like(path: &Path, endings: &[&str]) -> bool {
+    path.extension().is_some_and(|ending| endings.iter().any(|known| ending.eq_ignore_ascii_case(known)))
 }
 
 /// The picture without its ending, if there is one with any of them.

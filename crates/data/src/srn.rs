@@ -8,7 +8,7 @@
 
 use crate::camera::rigid_error;
 use crate::error::{At, Error, Result, read_text};
-use crate::pixels::{Pixels, is_picture};
+use crate::pixels::{ENDINGS, Pixels, ends_like};
 use glam::DMat4;
 use image::metadata::Orientation;
 use image::{ImageDecoder, RgbImage};
@@ -128,16 +128,14 @@ impl SrnSet {
 impl InstanceFiles {
     fn open(dir: PathBuf) -> Result<Self> {
         let mut views = BTreeMap::<String, [Option<PathBuf>; 2]>::new();
-        let is_text = |path: &Path| path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("txt"));
-        let kinds: [(&str, fn(&Path) -> bool); 2] = [("rgb", is_picture), ("pose", is_text)];
-        for (slot, (folder, is_one)) in kinds.into_iter().enumerate() {
+        for (slot, (folder, endings)) in [("rgb", &ENDINGS[..]), ("pose", &["txt"])].into_iter().enumerate() {
             let folder = dir.join(folder);
             for entry in std::fs::read_dir(&folder).at(&folder)? {
                 let entry = entry.at(&folder)?;
                 let path = entry.path();
                 // macOS leaves `._NAME.png` beside pictures, which is none.
                 let is_hidden = entry.file_name().to_string_lossy().starts_with('.');
-                if is_one(&path) && !is_hidden && !entry.file_type().at(&path)?.is_dir() {
+                if ends_like(&path, endings) && !is_hidden && !entry.file_type().at(&path)?.is_dir() {
                     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
                     views.entry(name).or_default()[slot] = Some(path);
                 }
