@@ -130,10 +130,7 @@ pub fn run(args: &Track) -> Result<bool> {
         let frame = query(&picture, side, &starts);
         let Tracked { found, is_searched: searched } = with_cooperative_said(&engine, || Ok(tracker.next(frame, |_| Ok(()))?))?;
         trusted = found.is_trusted();
-        // In pixels of the frame.
-        let frame_pixels = picture.pixels_on_disk(side);
-        let known = tracker.rim().map(|rim| rim * picture.intrinsics.fx);
-        let dilation = found.estimate.dilation.or(known).map(|by| by * frame_pixels);
+        let dilation = found.estimate.dilation.map(|by| by * picture.pixels_on_disk(side));
         let truth = args.truth.as_ref().map(|truth| truth.read(&path, &notation)).transpose()?;
         let error = truth.map(|truth| notation.error(PoseError::of(&found.world_from_camera, &truth)));
         errors.extend(error);

@@ -70,10 +70,12 @@ pub struct Estimate {
     pub curvature: Option<[[f64; 6]; 6]>,
     /// The light of the image, if the last phase has made up for it.
     pub light: Option<Light>,
-    /// By how many pixels the mask of the image was dilated at the end, if that was tried or given: below zero where it was too large.
+    /// By how many pixels the mask of the image was dilated at the end, if it has an outline: below zero where it was too large.
     pub dilation: Option<f64>,
     /// The image as it was compared at the end, dilated and in the model's light `[height, width, 3]`.
     pub target: Vec<f32>,
+    /// Pixels per row of it.
+    pub width: u32,
     /// How long the object's diagonal is in the picture, as a part of the picture's width.
     pub extent: f64,
     /// All starts, the winner first: more phases before fewer, then by loss.
@@ -198,7 +200,7 @@ struct Course<'a, F> {
     last: Option<usize>,
     /// Of each query, as the last phase made up for it.
     lights: Vec<Option<Light>>,
-    /// By how much the mask of each query is dilated, if that was tried or given.
+    /// By how much the mask of each query is dilated, if it has an outline.
     dilations: Vec<Option<f64>>,
     step: u32,
     steps: u32,
@@ -215,7 +217,7 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
             options,
             last: options.phases.iter().rposition(|phase| runs(&phase)),
             lights: vec![None; queries.len()],
-            dilations: queries.iter().map(|query| (query.dilation != 0.0).then_some(query.dilation)).collect(),
+            dilations: queries.iter().map(|query| query.can_dilate().then_some(query.dilation)).collect(),
             step: 0,
             steps: options.phases.iter().filter(runs).map(|phase| phase.steps).sum(),
             observe,
@@ -275,7 +277,7 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
             let best = own.min_by(|a, b| least(a).total_cmp(&least(b)));
             let per_area = |h: &Hypothesis| h.loss / query.area(h.dilation);
             let by = best.map(|tried| best_dilation(&tried.iter().map(per_area).collect::<Vec<_>>()));
-            *dilation = by.map(|by| dilation.unwrap_or(query.dilation) + by).or(*dilation);
+            *dilation = dilation.map(|given| given + by.unwrap_or(0.0));
         }
         let apart = |h: &&Hypothesis| (h.dilation - self.dilations[h.query].unwrap_or(0.0)).abs();
         let nearest = |tried: &[Hypothesis]| tried.iter().min_by(|a, b| apart(a).total_cmp(&apart(b))).copied();
@@ -304,9 +306,10 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         if let Some(light) = light {
             light.undo(&mut target, &coverage);
         }
-        let extent = query.intrinsics.fx / (pose.distance() * f64::from(query.width));
+        let width = query.width;
+        let extent = query.intrinsics.fx / (pose.distance() * f64::from(width));
         let ranking = own.iter().map(ranked).collect();
-        Estimate { pose, loss, curvature, light, dilation, target, extent, ranking }
+        Estimate { pose, loss, curvature, light, dilation, target, width, extent, ranking }
     }
 
     /// Takes hypotheses through a phase, those of a query one after the other, the best first. What second derivatives say at its end is found out where
