@@ -10,8 +10,8 @@ use std::process::ExitCode;
 use std::time::{Instant, SystemTime};
 
 use sigma_srn::{
-    Descent, Engine, Gpu, Intrinsics, Loss, Method, Model, ModelConfig, Options, Phase, Pose6, Query, Rays, Renderer, Shape,
-    Train, Trainer, TrainingBatch, camera, estimate, pixel_grid, stream,
+    Descent, Engine, Gpu, Intrinsics, Loss, Method, Model, ModelConfig, Options, Outline, Phase, Pose6, Query, Rays, Renderer,
+    Shape, Train, Trainer, TrainingBatch, camera, estimate, pixel_grid, stream,
 };
 use srn_tests::between;
 use srn_tests::peer::Peer;
@@ -404,10 +404,10 @@ impl Bench<'_> {
             rgb,
             weights: None,
             coverage: None,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             starts,
         };
-        let phases = vec![Phase { steps: 0, stride: 4, keep: 1, light: false, dilate: false }];
+        let phases = vec![Phase { steps: 0, stride: 4, keep: 1, light: false, outlines: false }];
         estimate(self.engine, self.model, &[query], &Options { phases, min_starts: 0, ..Options::default() }, |_| Ok(()))?;
         Ok(self.engine.cooperative_difference().unwrap_or(f64::NAN))
     }

@@ -1,6 +1,6 @@
 //! Baked models: one instance's networks do what the whole model does with that instance.
 
-use sigma_srn::{Descent, Engine, Error, Method, Model, ModelConfig, Options, Query, Renderer, Shape, Train, Trainer};
+use sigma_srn::{Descent, Engine, Error, Method, Model, ModelConfig, Options, Outline, Query, Renderer, Shape, Train, Trainer};
 use sigma_srn::{camera, estimate};
 use srn_tests::{assert_close, difference, gpu};
 
@@ -73,7 +73,7 @@ fn it_finds_the_same_pose() {
             rgb: rgb.clone(),
             weights: None,
             coverage: None,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             width: SIZE[0],
             height: SIZE[1],
             intrinsics: intrinsics(),

@@ -2,9 +2,10 @@
 
 use std::iter::zip;
 
+use glam::{DMat4, DVec2, DVec3};
 use sigma_srn::{
-    Descent, Engine, Intrinsics, Loss, Method, Model, ModelConfig, Options, Phase, Pose6, Query, Rays, Renderer, Shape, Train,
-    Trainer, TrainingBatch,
+    Descent, Engine, Intrinsics, Loss, Method, Model, ModelConfig, Options, Outline, Phase, Pose6, Query, Rays, Renderer, Shape,
+    Train, Trainer, TrainingBatch,
 };
 use sigma_srn::{camera, estimate, estimate_unseen, pixel_grid, stream};
 use srn_tests::{difference, gpu};
@@ -18,18 +19,18 @@ fn intrinsics() -> Intrinsics {
 }
 
 /// Two ellipsoids on white, a colour for each side of the world: instance 0 is tall, instance 1 is flat.
-fn picture(instance: u32, world_from_camera: &glam::DMat4) -> Vec<f32> {
-    let size = if instance == 0 { glam::DVec3::new(0.2, 0.3, 0.45) } else { glam::DVec3::new(0.45, 0.3, 0.2) };
+fn picture(instance: u32, world_from_camera: &DMat4) -> Vec<f32> {
+    let size = if instance == 0 { DVec3::new(0.2, 0.3, 0.45) } else { DVec3::new(0.45, 0.3, 0.2) };
     let k = intrinsics();
     let mut rgb = Vec::new();
     for (u, v) in pixel_grid(SIDE, SIDE, 1) {
-        let pixel = glam::DVec3::new((f64::from(u) - k.cx) / k.fx, (f64::from(v) - k.cy) / k.fy, 1.0);
+        let pixel = DVec3::new((f64::from(u) - k.cx) / k.fx, (f64::from(v) - k.cy) / k.fy, 1.0);
         let origin = world_from_camera.w_axis.truncate() / size;
         let direction = world_from_camera.transform_vector3(pixel) / size;
         // The unit sphere in scaled coordinates.
         let (a, b, c) = (direction.dot(direction), origin.dot(direction), origin.dot(origin) - 1.0);
         let root = b * b - a * c;
-        let colour = if root < 0.0 { glam::DVec3::ONE } else { origin - direction * ((b + root.sqrt()) / a) };
+        let colour = if root < 0.0 { DVec3::ONE } else { origin - direction * ((b + root.sqrt()) / a) };
         rgb.extend(colour.to_array().map(|value| value as f32));
     }
     rgb
@@ -95,9 +96,9 @@ fn a_run_repeats_bit_for_bit() {
 fn a_ray_shows_the_same_from_everywhere_on_it() {
     let mut model = trainer(&Engine::cpu()).model().unwrap().clone();
     let narrow = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pixel_center: 0.0 };
-    let towards = glam::DVec3::new(0.2, -0.1, 0.3);
+    let towards = DVec3::new(0.2, -0.1, 0.3);
     let cameras = [0.6, 0.9, 1.7, 4.0].map(|distance| {
-        let mut camera = camera::look_at_origin(distance * glam::DVec3::new(0.48, 0.64, 0.6));
+        let mut camera = camera::look_at_origin(distance * DVec3::new(0.48, 0.64, 0.6));
         camera.w_axis += towards.extend(0.0);
         (camera, narrow)
     });
@@ -134,7 +135,7 @@ fn poses_near_the_truth_come_nearer() {
         let mut random = stream(0, 0);
         truths.iter().for_each(|truth| rays.push(truth, &intrinsics(), pixel_grid(SIDE, SIDE, 1), &mut random));
         descent.set_targets(&[0, 1], &shown, &rays, &rendering.rgb, None).unwrap();
-        let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2);
+        let turn = DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.2);
         let starts: Vec<Pose6> = truths.iter().map(|truth| Pose6::from_matrix(&(turn * *truth))).collect();
         descent.set_poses(&starts).unwrap();
         for _ in 0..30 {
@@ -169,7 +170,7 @@ fn light_is_made_up_for() {
         let truths = [2, 9, 11].map(|k| camera::fixed24(1.3)[k]);
         let cameras = truths.map(|truth| (truth, intrinsics));
         let shown = Renderer::new(&engine, model, 3, SIDE, SIDE).unwrap().render(&[instance; 3], &cameras, 0).unwrap().rgb;
-        let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.08);
+        let turn = DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.08);
         let query = |k: usize, is_known: bool| {
             let view: Vec<f32> = shown.chunks(shown.len() / 3).nth(k).unwrap().iter().map(|c| c.clamp(-1.0, 1.0)).collect();
             let coverage: Vec<f32> = view.chunks(3).map(|rgb| if rgb.iter().any(|c| *c < 0.9) { 1.0 } else { 0.0 }).collect();
@@ -179,9 +180,19 @@ fn light_is_made_up_for() {
             };
             let rgb = view.iter().enumerate().map(light).collect();
             let (coverage, starts) = (is_known.then_some(coverage), vec![turn * truths[k]]);
-            Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
+            Query {
+                instance,
+                rgb,
+                weights: None,
+                coverage,
+                outline: Outline::AS_GIVEN,
+                width: SIDE,
+                height: SIDE,
+                intrinsics,
+                starts,
+            }
         };
-        let phases = [10, 10].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, dilate: false }).into();
+        let phases = [10, 10].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, outlines: false }).into();
         let options = Options { phases, min_starts: 0, align: false, ..Options::default() };
         let search = |queries: &[Query]| estimate(&engine, model, queries, &options, |_| Ok(())).unwrap();
         let [unknown, known] = [false, true].map(|is_known| search(&[0, 1, 2].map(|k| query(k, is_known))));
@@ -204,8 +215,17 @@ fn light_is_made_up_for() {
     let wrong = |coverage: Vec<f32>| {
         let (rgb, starts) = (vec![0.0; 3 * (SIDE * SIDE) as usize], camera::fixed24(1.3));
         let coverage = Some(coverage);
-        let query =
-            Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts };
+        let query = Query {
+            instance,
+            rgb,
+            weights: None,
+            coverage,
+            outline: Outline::AS_GIVEN,
+            width: SIDE,
+            height: SIDE,
+            intrinsics,
+            starts,
+        };
         estimate(&Engine::cpu(), model, &[query], &Options::default(), |_| Ok(())).unwrap_err().to_string()
     };
     assert!(wrong(vec![0.5; 7]).contains("coverage of 784"));
@@ -225,12 +245,12 @@ fn starts_are_aligned_with_what_is_cut_out() {
         let coverage: Vec<f32> = shown.rgb.chunks(3).map(is_object).collect();
         let mut start = truth;
         start.w_axis = (1.3 * truth.w_axis.truncate()).extend(1.0);
-        let start = start * glam::DMat4::from_rotation_y(0.06);
-        let phases = vec![Phase { steps: 0, stride: 1, keep: 1, light: false, dilate: false }];
+        let start = start * DMat4::from_rotation_y(0.06);
+        let phases = vec![Phase { steps: 0, stride: 1, keep: 1, light: false, outlines: false }];
         let options = Options { phases, min_starts: 0, ..Options::default() };
         let query = |coverage: Option<Vec<f32>>| {
             let (rgb, width, height, starts) = (shown.rgb.clone(), SIDE, SIDE, vec![start]);
-            Query { instance, rgb, weights: None, coverage, dilation: 0.0, width, height, intrinsics, starts }
+            Query { instance, rgb, weights: None, coverage, outline: Outline::AS_GIVEN, width, height, intrinsics, starts }
         };
         let queries = [query(None), query(Some(coverage))];
         let errors = |options: &Options| {
@@ -256,12 +276,12 @@ fn what_has_not_arrived_goes_on() {
         // With grain, so that a loss is left where it arrives.
         let rgb: Vec<f32> = zip(&shown.rgb, 0..).map(|(colour, k)| colour + 0.1 * ((k * k) as f32).sin()).collect();
         let query = |off: f64| {
-            let starts = vec![glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), off) * truth];
+            let starts = vec![DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), off) * truth];
             let (rgb, width, height) = (rgb.clone(), SIDE, SIDE);
-            Query { instance, rgb, weights: None, coverage: None, dilation: 0.0, width, height, intrinsics, starts }
+            Query { instance, rgb, weights: None, coverage: None, outline: Outline::AS_GIVEN, width, height, intrinsics, starts }
         };
         let options = |anew: u32| {
-            let phases = vec![Phase { steps: 4, stride: 1, keep: 1, light: false, dilate: false }];
+            let phases = vec![Phase { steps: 4, stride: 1, keep: 1, light: false, outlines: false }];
             Options { phases, min_starts: 0, anew, ..Options::default() }
         };
         let search = |options: &Options| {
@@ -305,6 +325,44 @@ pub fn with_rim(view: &[f32], side: usize) -> (Vec<f32>, Vec<f32>) {
     ((0..3 * side * side).map(colour).collect(), coverage)
 }
 
+/// A shadow that was taken for the object is cut away, and nothing of a mask without one.
+#[test]
+fn shadows_are_cut_away() {
+    const SIDE: u32 = 28;
+    let (ref model, instance, intrinsics) = shipped_forklift();
+    let engine = Engine::cpu();
+    let truth = camera::fixed24(1.3)[2];
+    let shown = Renderer::new(&engine, model, 1, SIDE, SIDE).unwrap().render(&[instance], &[(truth, intrinsics)], 0).unwrap();
+    let side = SIDE as usize;
+    let is_object = |pixel: usize| shown.rgb[3 * pixel..][..3].iter().any(|colour| *colour < 0.9);
+    // `wide` pixels below what is the object.
+    let masked = |wide: usize| {
+        let is_in_mask = |pixel: usize| (0..=wide).any(|k| pixel >= k * side && is_object(pixel - k * side));
+        let coverage = (0..side * side).map(|pixel| f32::from(u8::from(is_in_mask(pixel)))).collect();
+        let colour = |value: usize| match (is_object(value / 3), is_in_mask(value / 3)) {
+            (true, _) => shown.rgb[value].clamp(-1.0, 1.0),
+            (_, true) => [-0.5, -0.6, -0.7][value % 3],
+            _ => 1.0,
+        };
+        let rgb = (0..3 * side * side).map(colour).collect();
+        let starts = vec![DMat4::from_rotation_z(0.05) * truth];
+        let (width, height, outline) = (SIDE, SIDE, Outline::AS_GIVEN);
+        Query { instance, rgb, weights: None, coverage: Some(coverage), outline, width, height, intrinsics, starts }
+    };
+    let found = |wide: usize, phases: &[(u32, bool)]| {
+        let phase = |&(steps, outlines)| Phase { steps, stride: 1, keep: 1, light: false, outlines };
+        let phases = phases.iter().map(phase).collect();
+        let options = Options { phases, min_starts: 0, align: false, anew: 0, ..Options::default() };
+        estimate(&engine, model, &[masked(wide)], &options, |_| Ok(())).unwrap().remove(0)
+    };
+    let (steps, outlines) = ((10, false), (5, true));
+    let [without, with] = [[steps, steps].as_slice(), &[steps, outlines, steps]].map(|phases| found(3, phases));
+    println!("{:.4} {:.4} {:?}", without.loss, with.loss, with.outline);
+    assert_eq!(with.outline.unwrap().cut, DVec2::new(0.0, 3.0));
+    assert!(with.loss < 0.4 * without.loss, "{} {}", without.loss, with.loss);
+    assert_eq!(found(0, &[steps, outlines]).outline.unwrap().cut, DVec2::ZERO);
+}
+
 /// Where the coverage is known, dilations of it are tried; another picture beside it, or hypotheses that wait, are none the worse for it.
 #[test]
 fn masks_are_tried_dilated() {
@@ -317,9 +375,19 @@ fn masks_are_tried_dilated() {
         let (rgb, coverage) = with_rim(&shown.rgb, side);
         let query = |coverage: Option<&Vec<f32>>| {
             let (rgb, coverage, starts) = (rgb.clone(), coverage.cloned(), vec![camera::fixed24(1.3)[10], truth]);
-            Query { instance, rgb, weights: None, coverage, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
+            Query {
+                instance,
+                rgb,
+                weights: None,
+                coverage,
+                outline: Outline::AS_GIVEN,
+                width: SIDE,
+                height: SIDE,
+                intrinsics,
+                starts,
+            }
         };
-        let phase = |steps, keep, dilate| Phase { steps, stride: 1, keep, light: false, dilate };
+        let phase = |steps, keep, outlines| Phase { steps, stride: 1, keep, light: false, outlines };
         let phases = vec![phase(0, 2, false), phase(2, 1, true), phase(1, 2, false)];
         let options = Options { phases, min_starts: 0, align: false, anew: 0, ..Options::default() };
         let mut steps = Vec::new();
@@ -333,9 +401,10 @@ fn masks_are_tried_dilated() {
         // Nothing says where the object ends in a picture of nothing else.
         let [full, known, beside] =
             search(&[query(Some(&vec![1.0; side * side])), query(Some(&coverage)), query(None)]).unwrap().try_into().unwrap();
-        assert_eq!([&unknown[0], &full, &known, &beside].map(|found| found.dilation.is_some()), [false, false, true, false]);
+        assert_eq!([&unknown[0], &full, &known, &beside].map(|found| found.outline.is_some()), [false, false, true, false]);
         assert_eq!([&full, &beside].map(|found| (found.pose, found.loss)), [0, 2].map(|k| (unknown[k].pose, unknown[k].loss)));
-        assert!(known.dilation.unwrap() < -0.5 && known.dilation.unwrap() > -1.5, "{engine}: {:?}", known.dilation);
+        let outline = known.outline.unwrap();
+        assert!(outline.dilation < -0.5 && outline.dilation > -1.5 && outline.cut == DVec2::ZERO, "{engine}: {outline:?}");
         assert!((known.loss / unknown[0].loss) < 0.5, "{engine}: {} {}", known.loss, unknown[0].loss);
         assert_ne!(known.target, rgb);
         assert_eq!(beside.target, rgb);
@@ -344,21 +413,24 @@ fn masks_are_tried_dilated() {
             [[3, 3]; 2]
         );
         let without = [(0, 1, 6), (0, 1, 6), (1, 1, 6)];
-        let with = [(0, 3, 6), (0, 3, 5), (1, 3, 5), (2, 3, 5), (2, 3, 6), (3, 3, 6)];
+        let with = [(0, 3, 6), (0, 3, 13), (1, 3, 13), (2, 3, 13), (2, 3, 6), (3, 3, 6)];
         assert_eq!(steps, [without.as_slice(), &with].concat());
 
         // What is known of the outline already, as from another frame, holds from the beginning; where dilations are tried, they are beside it.
-        let given = |by: f64| Query { dilation: by, ..query(Some(&coverage)) };
+        let given = |dilation: f64| {
+            let outline = Outline { dilation, ..Outline::AS_GIVEN };
+            Query { outline, ..query(Some(&coverage)) }
+        };
         let plain = Options { phases: vec![phase(0, 2, false), phase(2, 1, false)], ..options.clone() };
         let found = |query: Query, options: &Options| {
             estimate(&engine, model, &[query], options, |_| Ok(())).map(|mut found| found.swap_remove(0))
         };
-        let follow = found(given(known.dilation.unwrap()), &plain).unwrap();
-        assert_eq!((follow.dilation, follow.target), (known.dilation, known.target));
-        let again = found(given(-2.0), &options).unwrap().dilation.unwrap();
+        let follow = found(given(outline.dilation), &plain).unwrap();
+        assert_eq!((follow.outline, follow.target), (known.outline, known.target));
+        let again = found(given(-2.0), &options).unwrap().outline.unwrap().dilation;
         assert!(again < -0.5 && again > -1.5, "{engine}: {again}");
         let error = found(given(f64::NAN), &plain).unwrap_err().to_string();
-        assert!(error.contains("dilated by NaN pixels"), "{error}");
+        assert!(error.contains("a mask whose outline is NaN pixels off"), "{error}");
     }
 }
 
@@ -377,13 +449,13 @@ fn an_object_is_found_without_its_name() {
             renderer.render(&[instance], &[(truth, intrinsics())], 0).unwrap().rgb
         };
         let rgb = rendered(model, instance);
-        let starts = vec![glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.1) * truth];
+        let starts = vec![DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.1) * truth];
         let query = Query {
             instance: 99,
             rgb,
             weights: None,
             coverage: None,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             width: SIDE,
             height: SIDE,
             intrinsics: intrinsics(),
@@ -423,8 +495,17 @@ fn the_code_of_an_unknown_object_does_not_see_what_does_not_count() {
         }
         let (weights, starts) = (Some(weights.clone()), vec![truth]);
         let [width, height] = [SIDE; 2];
-        let query =
-            Query { instance: 0, rgb, weights, coverage: None, dilation: 0.0, width, height, intrinsics: intrinsics(), starts };
+        let query = Query {
+            instance: 0,
+            rgb,
+            weights,
+            coverage: None,
+            outline: Outline::AS_GIVEN,
+            width,
+            height,
+            intrinsics: intrinsics(),
+            starts,
+        };
         let found = estimate_unseen(&engine, trainer.model().unwrap(), &query, 0, |_, _| Ok(())).unwrap();
         (found.estimate.pose, found.estimate.loss, found.model)
     };
@@ -441,20 +522,20 @@ fn second_derivatives_are_those_of_the_place() {
     let model = trainer.model().unwrap();
     let truth = camera::fixed24(1.3)[1];
     let rgb = picture(1, &truth);
-    let starts = vec![glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2) * truth];
+    let starts = vec![DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.2) * truth];
     let query = Query {
         instance: 1,
         rgb,
         weights: None,
         coverage: None,
-        dilation: 0.0,
+        outline: Outline::AS_GIVEN,
         width: SIDE,
         height: SIDE,
         intrinsics: intrinsics(),
         starts,
     };
     for engine in engines() {
-        let phases = vec![Phase { steps: 15, stride: 1, keep: 1, light: false, dilate: false }];
+        let phases = vec![Phase { steps: 15, stride: 1, keep: 1, light: false, outlines: false }];
         let options = Options { phases, min_starts: 0, seed: 0, ..Options::default() };
         let mut learnt = Vec::new();
         let observe = |progress: sigma_srn::Progress| {
@@ -496,14 +577,14 @@ fn hypotheses_of_one_pose_have_one_loss() {
             rgb: (0..3 * SIDE * SIDE).map(|k| (k as f32 * 0.7).sin()).collect(),
             weights: None,
             coverage: None,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             width: SIDE,
             height: SIDE,
             intrinsics,
             starts: vec![start; 3],
         };
         let losses = |options: Options| {
-            let phases = vec![Phase { steps: 0, stride: 1, keep: usize::MAX, light: false, dilate: false }];
+            let phases = vec![Phase { steps: 0, stride: 1, keep: usize::MAX, light: false, outlines: false }];
             let options = Options { phases, min_starts: 0, ..options };
             let found = estimate(&engine, model, std::slice::from_ref(&query), &options, |_| Ok(())).unwrap();
             found[0].ranking.iter().map(|ranked| ranked.loss).collect::<Vec<_>>()
@@ -526,9 +607,19 @@ fn rounding_does_not_part_searches() {
     let shown = Renderer::new(&engine, model, 24, SIDE, SIDE).unwrap().render(&[instance; 24], &cameras, 0).unwrap().rgb;
     let query = |k: usize, by: f32| {
         let rgb = shown.chunks(shown.len() / 24).nth(k).unwrap().iter().map(|c| (by * c).clamp(-1.0, 1.0)).collect();
-        let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.3);
+        let turn = DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.3);
         let starts = vec![turn * truths[k]];
-        Query { instance, rgb, weights: None, coverage: None, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
+        Query {
+            instance,
+            rgb,
+            weights: None,
+            coverage: None,
+            outline: Outline::AS_GIVEN,
+            width: SIDE,
+            height: SIDE,
+            intrinsics,
+            starts,
+        }
     };
     let together = |grain: f32| {
         let options = Options { method: Method::Bfgs { soft: 0.3, grain }, min_starts: 0, ..Options::default() };
@@ -555,14 +646,24 @@ fn white_costs_nothing() {
     for engine in engines() {
         let cameras = truths.map(|truth| (truth, intrinsics));
         let shown = Renderer::new(&engine, model, 2, SIDE, SIDE).unwrap().render(&[instance; 2], &cameras, 0).unwrap().rgb;
-        let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.08);
+        let turn = DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.08);
         let query = |k: usize| {
             let rgb = shown.chunks(shown.len() / 2).nth(k).unwrap().iter().map(|c| c.clamp(-1.0, 1.0)).collect();
             let starts = vec![turn * truths[k]];
-            Query { instance, rgb, weights: None, coverage: None, dilation: 0.0, width: SIDE, height: SIDE, intrinsics, starts }
+            Query {
+                instance,
+                rgb,
+                weights: None,
+                coverage: None,
+                outline: Outline::AS_GIVEN,
+                width: SIDE,
+                height: SIDE,
+                intrinsics,
+                starts,
+            }
         };
         let search = |queries: &[Query], steps: u32| {
-            let phases = vec![Phase { steps, stride: 1, keep: 1, light: false, dilate: false }];
+            let phases = vec![Phase { steps, stride: 1, keep: 1, light: false, outlines: false }];
             let options = Options { phases, min_starts: 0, ..Options::default() };
             let mut flops = 0;
             let found = estimate(&engine, model, queries, &options, |progress| {
@@ -612,7 +713,7 @@ fn what_does_not_count_has_no_influence() {
         rgb: rgb.to_vec(),
         weights: weights.map(<[f32]>::to_vec),
         coverage: None,
-        dilation: 0.0,
+        outline: Outline::AS_GIVEN,
         width: SIDE,
         height: SIDE,
         intrinsics: intrinsics(),
@@ -621,7 +722,8 @@ fn what_does_not_count_has_no_influence() {
     let adam = |loss| Method::Adam { loss, learning_rate: 0.01 };
     let methods = [Loss::Mae, Loss::NormL2].map(adam).into_iter().chain([Method::Bfgs { soft: 0.3, grain: 0.0 }]);
     for method in methods {
-        let phases = [(2, 4), (1, 2)].map(|(stride, keep)| Phase { steps: 3, stride, keep, light: false, dilate: false }).into();
+        let phases =
+            [(2, 4), (1, 2)].map(|(stride, keep)| Phase { steps: 3, stride, keep, light: false, outlines: false }).into();
         let options = Options { method, min_starts: 0, align: false, phases, anew: 0, seed: 0 };
         for engine in engines() {
             let found = |rgb: &[f32], weights| {

@@ -1,6 +1,6 @@
 //! Cooperative matrices, on a device that has them: used where they hardly change gradients, and only there.
 
-use sigma_srn::{Engine, Gpu, Intrinsics, Method, Model, Options, Phase, Query, Renderer, camera, estimate};
+use sigma_srn::{Engine, Gpu, Intrinsics, Method, Model, Options, Outline, Phase, Query, Renderer, camera, estimate};
 use srn_gpu::Choice;
 use srn_tests::{cooperative_gpu, gpu};
 
@@ -23,10 +23,10 @@ fn found(engine: &Engine) -> (f64, f64) {
         rgb: rendering.rgb,
         weights: None,
         coverage: None,
-        dilation: 0.0,
+        outline: Outline::AS_GIVEN,
         starts,
     };
-    let phases = vec![Phase { steps: 30, stride: 1, keep: usize::MAX, light: false, dilate: false }];
+    let phases = vec![Phase { steps: 30, stride: 1, keep: usize::MAX, light: false, outlines: false }];
     let options =
         Options { method: Method::Bfgs { soft: 1.0, grain: 0.0 }, min_starts: 0, align: false, phases, anew: 0, seed: 0 };
     let estimate = estimate(engine, model, &[query], &options, |_| Ok(())).unwrap().remove(0);

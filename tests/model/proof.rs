@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use sigma_srn::{Engine, Error, Gpu, Method, Model, Options, Phase, Query, Renderer, Train, Trainer, camera, estimate};
+use sigma_srn::{Engine, Error, Gpu, Method, Model, Options, Outline, Phase, Query, Renderer, Train, Trainer, camera, estimate};
 use srn_gpu::Choice;
 use srn_tests::gpu;
 
@@ -32,8 +32,9 @@ fn found(engine: &Engine) -> Result<[f64; 6], Error> {
     let view = Renderer::new(&Engine::cpu(), model, 1, width, height)?.render(&[1], &[(truth, intrinsics())], 0)?;
     let starts = vec![glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2) * truth];
     let (intrinsics, rgb) = (intrinsics(), view.rgb);
-    let query = Query { instance: 1, intrinsics, width, height, rgb, weights: None, coverage: None, dilation: 0.0, starts };
-    let phases = vec![Phase { steps: 4, stride: 1, keep: usize::MAX, light: false, dilate: false }];
+    let query =
+        Query { instance: 1, intrinsics, width, height, rgb, weights: None, coverage: None, outline: Outline::AS_GIVEN, starts };
+    let phases = vec![Phase { steps: 4, stride: 1, keep: usize::MAX, light: false, outlines: false }];
     let options =
         Options { method: Method::Bfgs { soft: 1.0, grain: 0.0 }, min_starts: 0, align: false, phases, anew: 0, seed: 0 };
     Ok(estimate(engine, model, &[query], &options, |_| Ok(()))?.remove(0).pose.0)

@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use sigma_srn::{Effort, Engine, Intrinsics, Model, Options, Query, Renderer, Search, Tracked, Tracker, camera};
+use sigma_srn::{Effort, Engine, Intrinsics, Model, Options, Outline, Query, Renderer, Search, Tracked, Tracker, camera};
 
 fn main() -> Result<(), sigma_srn::Error> {
     let path = std::env::args().nth(1).unwrap_or_else(|| "assets/models/compact.safetensors".into());
@@ -29,7 +29,7 @@ fn main() -> Result<(), sigma_srn::Error> {
             rgb: renderer.render(&[0], &[(truth, intrinsics)], 0)?.rgb,
             weights: None,
             coverage: None,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             width: SIDE,
             height: SIDE,
             intrinsics,

@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use sigma_srn::{Engine, Intrinsics, Model, Query, Renderer, Search, camera};
+use sigma_srn::{Engine, Intrinsics, Model, Outline, Query, Renderer, Search, camera};
 
 fn main() -> Result<(), sigma_srn::Error> {
     let path = std::env::args().nth(1).unwrap_or_else(|| "assets/models/compact.safetensors".into());
@@ -23,7 +23,7 @@ fn main() -> Result<(), sigma_srn::Error> {
         rgb,
         weights: None,
         coverage: None,
-        dilation: 0.0,
+        outline: Outline::AS_GIVEN,
         width: SIDE,
         height: SIDE,
         intrinsics,

@@ -161,12 +161,12 @@ pub fn motion(from: &DMat4, to: &DMat4) -> [f64; 6] {
     [a, b, c, shift.x, shift.y, shift.z]
 }
 
-/// Where a mask says where the object ends: how much larger all variances are; by how many pixels the outline is still off when its dilation has been
+/// Where a mask says where the object ends: how much larger all variances are; by how many pixels the outline is still off when it has been
 /// found; and by which part of that, since what is cut away, or left on, is hardly the same all around (the latter two are standard deviations). By pictures
 /// whose masks were made wrong (`docs/accuracy.md`).
 const CUT_OUT: f64 = 2.0;
 const OUTLINE: f64 = 0.25;
-const OF_DILATION: f64 = 0.3;
+const OF_MOVED: f64 = 0.3;
 
 /// What a picture may leave unexplained where there is no calibration.
 const UNEXPLAINED: f64 = 0.25;
@@ -251,11 +251,11 @@ impl Estimate {
     pub fn covariance(&self, instance: &str, calibration: &Calibration) -> Option<Matrix6> {
         let size = calibration.sizes.get(instance).copied().unwrap_or(1.0);
         let mixed = mixed(&self.shape()?, calibration.curvature, &calibration.floor_of(self));
-        let Some(dilation) = self.dilation else { return Some(mixed.map(|row| row.map(|entry| size * entry))) };
+        let Some(outline) = self.outline else { return Some(mixed.map(|row| row.map(|entry| size * entry))) };
         // The views that a calibration is from have no masks. An object whose outline is taken to be farther out seems larger, and nearer.
         let mut covariance = mixed.map(|row| row.map(|entry| CUT_OUT * size * entry));
         let radius = 0.5 * self.extent * f64::from(self.width);
-        covariance[5][5] += (self.pose.distance() * OUTLINE.hypot(OF_DILATION * dilation) / radius).powi(2);
+        covariance[5][5] += (self.pose.distance() * OUTLINE.hypot(OF_MOVED * outline.length()) / radius).powi(2);
         Some(covariance)
     }
 
@@ -416,6 +416,7 @@ fn forward(lower: &Matrix6, mut x: [f64; 6]) -> [f64; 6] {
 mod tests {
     use super::*;
     use crate::camera::{Pose6, look_at_origin};
+    use crate::mask::Outline;
     use crate::model::ModelConfig;
     use crate::random::{normal, stream};
 
@@ -436,7 +437,7 @@ mod tests {
             loss: 2.0,
             curvature: Some(curvature()),
             light: None,
-            dilation: None,
+            outline: None,
             target: vec![],
             width: 64,
             extent: 0.5,
@@ -559,8 +560,8 @@ mod tests {
     /// its distance as that is of half the object's diagonal.
     #[test]
     fn a_mask_leaves_a_pose_less_sure() {
-        let variances = |dilation| {
-            let estimate = Estimate { dilation, ..estimate(look_at_origin(DVec3::new(0.0, 1.3, 0.0))) };
+        let variances = |outline| {
+            let estimate = Estimate { outline, ..estimate(look_at_origin(DVec3::new(0.0, 1.3, 0.0))) };
             let covariance = estimate.covariance("", &calibration(0.0, [1e-4; 6])).unwrap();
             [0, 4, 5].map(|k| (1e12 * covariance[k][k]).round())
         };
@@ -568,7 +569,8 @@ mod tests {
         for (dilation, off) in [(0.0, 0.25), (2.0, 0.65), (-2.0, 0.65)] {
             // In pixels, 0.65² = 0.25² + (0.3 · 2)².
             let along: f64 = off * 1.3 / 16.0;
-            assert_eq!(variances(Some(dilation)), [2e8, 2e8, (2e8 + 1e12 * along * along).round()], "{dilation}");
+            let outline = Outline { dilation, ..Outline::AS_GIVEN };
+            assert_eq!(variances(Some(outline)), [2e8, 2e8, (2e8 + 1e12 * along * along).round()], "{dilation}");
         }
     }
 

@@ -33,6 +33,7 @@ pub use engine::Engine;
 pub use error::Error;
 pub use estimator::{Effort, Estimate, Options, Phase, Progress, Query, Ranked, estimate};
 pub use light::Light;
+pub use mask::Outline;
 pub use model::{Block, Hypernetwork, Kind, Layout, Metadata, Model, ModelConfig, Parameter, Source, write_atomically};
 pub use random::{Random, stream};
 pub use rays::{Rays, pixel_grid};

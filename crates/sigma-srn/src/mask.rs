@@ -1,14 +1,77 @@
 //! The mask of a picture that is cut out. Who cuts leaves a rim of what is behind the object, or takes a little of the object away; it
 //! then seems larger, or smaller, than it is.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{FRAC_1_SQRT_2, TAU};
+use std::iter::zip;
+use std::ops::{Add, Mul};
+
+use glam::DVec2;
+
+/// How the outline of a mask is moved before a picture is compared, in pixels; by default not at all.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Outline {
+    /// How far out all around, or in where this is below zero.
+    pub dilation: f64,
+    /// What is cut away on one side, a shadow that was taken for the object: where it is (columns, rows), and how wide.
+    pub cut: DVec2,
+}
+
+impl Outline {
+    /// As the mask is.
+    pub const AS_GIVEN: Outline = Outline { dilation: 0.0, cut: DVec2::ZERO };
+
+    /// How far it is moved.
+    pub(crate) fn length(&self) -> f64 {
+        self.dilation.hypot(self.cut.length())
+    }
+}
+
+impl Add for Outline {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Outline { dilation: self.dilation + other.dilation, cut: self.cut + other.cut }
+    }
+}
+
+impl Mul<f64> for Outline {
+    type Output = Self;
+
+    /// In pixels that are so many times smaller.
+    fn mul(self, times: f64) -> Self {
+        Outline { dilation: times * self.dilation, cut: times * self.cut }
+    }
+}
 
 /// How far masks are tried dilated, in pixels; the first is as given.
-pub(crate) const DILATIONS: [f64; 5] = [0.0, -1.0, 1.0, -2.0, 2.0];
+const DILATIONS: [f64; 5] = [0.0, -1.0, 1.0, -2.0, 2.0];
+
+/// How much is tried to be cut away on a side, in pixels, and on which.
+const CUT: f64 = 3.0;
+const SIDES: [DVec2; 8] = [
+    DVec2::X,
+    DVec2::splat(FRAC_1_SQRT_2),
+    DVec2::Y,
+    DVec2::new(-FRAC_1_SQRT_2, FRAC_1_SQRT_2),
+    DVec2::NEG_X,
+    DVec2::splat(-FRAC_1_SQRT_2),
+    DVec2::NEG_Y,
+    DVec2::new(FRAC_1_SQRT_2, -FRAC_1_SQRT_2),
+];
+
+/// What is tried of a mask: the first is as given.
+pub(crate) fn outlines() -> impl Iterator<Item = Outline> {
+    let dilations = DILATIONS.into_iter().map(|dilation| Outline { dilation, ..Outline::AS_GIVEN });
+    dilations.chain(SIDES.into_iter().map(|side| Outline { cut: CUT * side, ..Outline::AS_GIVEN }))
+}
 
 /// By which part of the loss a dilation must be better than the mask as given, for each pixel. At a pose that is wrong a mask that is wrong explains a
 /// little more, too; and of exact masks the best are some tenths of a pixel off, by the shape that a network has learnt.
 const BETTER: f64 = 0.15;
+
+/// Which part of the least loss that dilations leave, for each pixel, a cut must leave at most: shadows leave 0.35 to 0.75, but for some of an object without
+/// details; masks without one 0.85 and more, but for some of that object (`docs/accuracy.md`).
+const CUT_LEAVES: f64 = 0.75;
 
 /// Directions in which a pixel looks around.
 const DIRECTIONS: usize = 16;
@@ -20,20 +83,46 @@ pub(crate) fn has_outline(coverage: &[f32], weights: Option<&[f32]>) -> bool {
     has(|cover| cover < 0.5) && has(|cover| cover >= 0.5)
 }
 
-/// Colours and coverage of a picture on white, as if the outline of its mask were `by` pixels farther out, or in if it is negative: each pixel takes
-/// the most, or the least, coverage within this distance. Where the object grows, it has the colour of the place that it grows from. Where pixels do not
-/// count, nothing is known of the outline. `rgb [pixels, 3]`, `coverage` and `weights [pixels]`, `width` pixels per row.
-pub(crate) fn dilated(rgb: &[f32], coverage: &[f32], weights: Option<&[f32]>, width: usize, by: f64) -> (Vec<f32>, Vec<f32>) {
-    let rings = by.abs().ceil() as usize;
-    let ring =
-        |ring: usize| (0..DIRECTIONS).map(move |k| (by.abs() * ring as f64 / rings as f64, TAU * k as f64 / DIRECTIONS as f64));
-    let offsets: Vec<[f64; 2]> = (1..=rings).flat_map(ring).map(|(far, angle)| [far * angle.cos(), far * angle.sin()]).collect();
+/// Colours and coverage of a picture on white, as if the outline of its mask were moved: what is cut away first, then all around. `rgb [pixels, 3]`,
+/// `coverage` and `weights [pixels]`, `width` pixels per row.
+pub(crate) fn with_outline(
+    rgb: &[f32],
+    coverage: &[f32],
+    weights: Option<&[f32]>,
+    width: usize,
+    outline: Outline,
+) -> (Vec<f32>, Vec<f32>) {
+    let Outline { dilation, cut } = outline;
+    let parts = |length: f64| 1..=length.abs().ceil() as usize;
+    // Twice as many as pixels, so that nothing narrow is passed over.
+    let along = parts(2.0 * cut.length());
+    let last = *along.end() as f64;
+    let side: Vec<DVec2> = along.map(|part| part as f64 / last * cut).collect();
+    let (rgb, coverage) = moved(rgb, coverage, weights, width, &side, false);
+    let rings = parts(dilation);
+    let last = *rings.end() as f64;
+    let ring = |ring: usize| {
+        (0..DIRECTIONS).map(move |k| dilation.abs() * ring as f64 / last * DVec2::from_angle(TAU * k as f64 / DIRECTIONS as f64))
+    };
+    moved(&rgb, &coverage, weights, width, &rings.flat_map(ring).collect::<Vec<_>>(), dilation > 0.0)
+}
+
+/// Each pixel takes the most, or the least, coverage of what lies at these offsets. Where the object grows, it has the colour of the place that it grows
+/// from. Where pixels do not count, nothing is known of the outline.
+fn moved(
+    rgb: &[f32],
+    coverage: &[f32],
+    weights: Option<&[f32]>,
+    width: usize,
+    offsets: &[DVec2],
+    grows: bool,
+) -> (Vec<f32>, Vec<f32>) {
     let (mut colours, mut covers) = (rgb.to_vec(), coverage.to_vec());
     for (pixel, (colours, cover)) in colours.chunks_exact_mut(3).zip(&mut covers).enumerate() {
-        let place = |offset: &[f64; 2]| [(pixel % width) as f64 + offset[0], (pixel / width) as f64 + offset[1]];
+        let place = |offset: &DVec2| [(pixel % width) as f64 + offset.x, (pixel / width) as f64 + offset.y];
         let around = offsets.iter().filter_map(|offset| between(rgb, coverage, weights, width, place(offset)));
         let before = *cover;
-        if by < 0.0 {
+        if !grows {
             *cover = around.map(|(cover, _)| cover).fold(before, f32::min);
             let left = if before > 0.0 { *cover / before } else { 1.0 };
             colours.iter_mut().for_each(|colour| *colour = 1.0 + left * (*colour - 1.0));
@@ -77,9 +166,19 @@ fn between(rgb: &[f32], coverage: &[f32], weights: Option<&[f32]>, width: usize,
     Some((cover, darker))
 }
 
+/// What leaves the least loss: a cut, if that is much less than what dilations leave, else a dilation. `losses` are in the order of [`outlines`].
+pub(crate) fn best_outline(losses: &[f64]) -> Outline {
+    let (dilated, cut) = losses.split_at(DILATIONS.len());
+    let least = dilated.iter().copied().fold(f64::INFINITY, f64::min);
+    match zip(cut, outlines().skip(DILATIONS.len())).min_by(|a, b| a.0.total_cmp(b.0)) {
+        Some((loss, cut)) if *loss < CUT_LEAVES * least => cut,
+        _ => Outline { dilation: best_dilation(dilated), ..Outline::AS_GIVEN },
+    }
+}
+
 /// The dilation with the least loss: where a parabola through the losses at the best that was tried and to either side of it ends; none, if the mask is not
 /// that much worse as given. `losses` are in the order of [`DILATIONS`].
-pub(crate) fn best_dilation(losses: &[f64]) -> f64 {
+fn best_dilation(losses: &[f64]) -> f64 {
     let mut tried: Vec<(f64, f64)> = DILATIONS.into_iter().zip(losses.iter().copied()).collect();
     tried.sort_by(|a, b| a.0.total_cmp(&b.0));
     let Some(best) = (0..tried.len()).min_by(|&a, &b| tried[a].1.total_cmp(&tried[b].1)) else { return 0.0 };
@@ -98,6 +197,10 @@ pub(crate) fn best_dilation(losses: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn dilated(rgb: &[f32], coverage: &[f32], weights: Option<&[f32]>, width: usize, by: f64) -> (Vec<f32>, Vec<f32>) {
+        with_outline(rgb, coverage, weights, width, Outline { dilation: by, ..Outline::AS_GIVEN })
+    }
 
     const WIDTH: usize = 12;
 
@@ -132,6 +235,49 @@ mod tests {
                 assert!(rgb.iter().zip(on_white).all(|(a, b)| (a - b).abs() < 1e-5), "{by}: {rgb:?} {on_white:?}");
             }
         }
+    }
+
+    #[test]
+    fn a_shadow_is_cut_away() {
+        // Below a disc as much of it again.
+        let (rgb, coverage) = disc(3.2);
+        let below = |pixel: usize| if pixel < 2 * WIDTH { 0.0 } else { coverage[pixel - 2 * WIDTH] };
+        let shadow: Vec<f32> = coverage.iter().enumerate().map(|(pixel, cover)| cover.max(below(pixel))).collect();
+        let rgb: Vec<f32> = (0..rgb.len()).map(|value| rgb[value].min(1.0 - shadow[value / 3])).collect();
+        let outline = |u: f64, v: f64| Outline { cut: DVec2::new(u, v), ..Outline::AS_GIVEN };
+        let apart = |outline: Outline| {
+            let (_, cut) = with_outline(&rgb, &shadow, None, WIDTH, outline);
+            cut.iter().zip(&coverage).map(|(a, b)| (a - b).abs()).sum::<f32>()
+        };
+        assert!(apart(outline(0.0, 2.0)) < 0.1 * apart(Outline::AS_GIVEN), "{}", apart(outline(0.0, 2.0)));
+        assert!(
+            apart(outline(0.0, -2.0)) > 0.9 * apart(Outline::AS_GIVEN)
+                && apart(outline(2.0, 0.0)) > 0.9 * apart(Outline::AS_GIVEN)
+        );
+        // After that it is dilated all around.
+        let both = Outline { dilation: 1.0, ..outline(0.0, 2.0) };
+        let ((rgb_cut, cut), (_, dilated)) =
+            (with_outline(&rgb, &shadow, None, WIDTH, outline(0.0, 2.0)), with_outline(&rgb, &shadow, None, WIDTH, both));
+        assert_eq!(dilated, self::dilated(&rgb_cut, &cut, None, WIDTH, 1.0).1);
+    }
+
+    #[test]
+    fn a_cut_must_leave_much_less_than_dilations() {
+        // A quarter of the way around.
+        let below = outlines().nth(DILATIONS.len() + 2).unwrap();
+        assert_eq!(below.cut, DVec2::new(0.0, 3.0));
+        let losses = |dilated: f64, cut: f64| {
+            let of = |outline: Outline| match outline {
+                Outline { dilation: -1.0, .. } => dilated,
+                outline if outline == below => cut,
+                _ => 1.0,
+            };
+            best_outline(&outlines().map(of).collect::<Vec<_>>())
+        };
+        let dilated = Outline { dilation: -1.0, ..Outline::AS_GIVEN };
+        assert_eq!([losses(1.0, 0.76), losses(1.0, 0.74)], [Outline::AS_GIVEN, below]);
+        assert_eq!([losses(0.5, 0.38), losses(0.5, 0.37)], [dilated, below]);
+        assert_eq!([f64::INFINITY, f64::NAN].map(|loss| best_outline(&[loss; 13])), [Outline::AS_GIVEN; 2]);
     }
 
     #[test]

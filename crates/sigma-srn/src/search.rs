@@ -218,7 +218,7 @@ mod tests {
 
     use super::*;
     use crate::camera::fixed24;
-    use crate::{Intrinsics, ModelConfig};
+    use crate::{Intrinsics, ModelConfig, Outline};
 
     fn model() -> Model {
         Model::init(&ModelConfig { hidden: 8, latent: 4, instances: 1, tracing_steps: 2, density: true }, 3).unwrap()
@@ -230,7 +230,7 @@ mod tests {
             rgb: (0..192).map(|k| shade - (k % 7) as f32 / 9.0).collect(),
             weights: None,
             coverage: None,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             width: 8,
             height: 8,
             intrinsics: Intrinsics { fx: 9.0, fy: 9.0, cx: 4.0, cy: 4.0, pixel_center: 0.0 },

@@ -4,11 +4,13 @@ use glam::DMat4;
 
 use crate::confidence::Doubt;
 use crate::estimator::{Options, Phase, Progress, Query};
+use crate::mask::Outline;
 use crate::search::{Found, Search};
 use crate::{Engine, Error, Model};
 
 /// Pixels that a mask may be off, as the model sees it: as far as a search tries. An object that comes from near to far has fewer pixels to lose.
 const WIDEST_RIM: f64 = 2.0;
+const WIDEST_CUT: f64 = 3.0;
 
 /// Follows an object through the frames of a video. A frame that the last pose does not lead to is searched all around.
 #[derive(Clone, Debug)]
@@ -22,7 +24,7 @@ pub struct Tracker {
     search: Search,
     /// The last two poses, the later one first.
     before: Vec<DMat4>,
-    rim: Option<f64>,
+    rim: Option<Outline>,
 }
 
 /// What was found for a frame.
@@ -44,7 +46,7 @@ impl Tracker {
     }
 
     /// Finds the pose in the next frame. [`Query::starts`] are where to search if it does not lie near the last pose, all around the object say.
-    /// [`Query::dilation`] is not looked at: who cuts frames out does it alike from one to the next, so by how much masks are too small is found out once.
+    /// [`Query::outline`] is not looked at: who cuts frames out does it alike from one to the next, so how wrong masks are is found out once.
     pub fn next(&mut self, frame: Query, mut observe: impl FnMut(Progress) -> Result<(), Error>) -> Result<Tracked, Error> {
         if frame.instance != self.instance {
             let what = format!("shows instance {}, but {} is followed", frame.instance, self.instance);
@@ -52,8 +54,9 @@ impl Tracker {
         }
         let (engine, model) = (&self.engine, &self.model);
         let focal = frame.intrinsics.fx;
-        let dilation = (self.rim.unwrap_or(0.0) * focal).clamp(-WIDEST_RIM, WIDEST_RIM);
-        let frame = Query { instance: self.number, dilation, ..frame };
+        let Outline { dilation, cut } = self.rim.unwrap_or_default() * focal;
+        let outline = Outline { dilation: dilation.clamp(-WIDEST_RIM, WIDEST_RIM), cut: cut.clamp_length_max(WIDEST_CUT) };
+        let frame = Query { instance: self.number, outline, ..frame };
         let near = match self.before[..] {
             [] => None,
             [last] => Some(vec![last]),
@@ -76,7 +79,7 @@ impl Tracker {
         };
         // Else it was not tried.
         if found.is_trusted() && (is_searched || self.rim.is_none()) {
-            self.rim = found.estimate.dilation.map(|by| by / focal).or(self.rim);
+            self.rim = found.estimate.outline.map(|by| by * (1.0 / focal)).or(self.rim);
         }
         self.before.truncate(if is_searched { 0 } else { 1 });
         // Else what is not to be trusted is no place to go on from.
@@ -86,20 +89,19 @@ impl Tracker {
         Ok(Tracked { found, is_searched })
     }
 
-    /// By how much the masks of the frames are too small, or too large where this is below zero, as far as that was tried: as a part of the
-    /// distance, or pixels over the focal length.
-    pub fn rim(&self) -> Option<f64> {
+    /// How the outlines of the frames' masks are moved, as far as that was tried, in pixels over the focal length.
+    pub fn rim(&self) -> Option<Outline> {
         self.rim
     }
 
     /// The next pose is near; what would have to be found from afar is searched for all around instead.
     fn near(&self) -> Result<Search, Error> {
-        let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, dilate: false };
+        let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, outlines: false };
         let phases = match (&self.before[..], self.rim) {
             // A look says whether it stands still or goes on.
             ([_, _, ..], _) => vec![phase(0, 4, 2), phase(3, 2, 1), phase(4, 1, 1)],
             (_, Some(_)) => vec![phase(5, 2, 1), phase(3, 1, 1)],
-            (_, None) => vec![phase(5, 2, 1), Phase { dilate: true, ..phase(5, 2, 1) }, phase(3, 1, 1)],
+            (_, None) => vec![phase(5, 2, 1), Phase { outlines: true, ..phase(5, 2, 1) }, phase(3, 1, 1)],
         };
         let (first, _) = self.search.tries()?;
         // Steps so few are those of BFGS, also after a first search the paper's way.

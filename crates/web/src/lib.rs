@@ -13,7 +13,7 @@ use glam::DMat4;
 use js_sys::futures::jspi_block_on_promise;
 use js_sys::{Function, Promise};
 use sigma_srn::camera::{around84, neighbor4};
-use sigma_srn::{Effort, Engine, Gpu, Intrinsics, Model, Options, Query, Renderer, Search, wgpu};
+use sigma_srn::{Effort, Engine, Gpu, Intrinsics, Model, Options, Outline, Query, Renderer, Search, wgpu};
 use wasm_bindgen::prelude::*;
 
 /// A model on an executor.
@@ -85,7 +85,7 @@ impl Session {
             rgb,
             weights: None,
             coverage: coverage.iter().any(|&covered| covered < 1.0).then_some(coverage),
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             width: side,
             height: side,
             intrinsics,

@@ -11,6 +11,7 @@ use sigma_srn::{Confidence, Doubt, Found, Light, Model, Pose6};
 use srn_data::camera::Axes;
 
 use super::files::{Masks, ObjectArgs, Picture, PoseSource, model_side, srn_instance, warn_of_turned};
+use super::mask::MadeRight;
 use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
@@ -106,8 +107,9 @@ struct ImageReport {
     confidence: Option<Confidence>,
     /// Of a picture that is cut out: what takes the object's colours there to the model's.
     light: Option<Light>,
-    /// By how many pixels of the photograph its mask was dilated: below zero where it was too large.
-    mask_dilation_px: Option<f64>,
+    /// How its mask was made right.
+    #[serde(flatten)]
+    mask: MadeRight,
     /// The best pose elsewhere that the search followed to the end.
     rival: Option<Rival>,
     /// 2 if a second, exhaustive search has found it, for the first one's pose was not to be trusted.
@@ -332,7 +334,7 @@ impl Output<'_> {
             doubt: found.doubt,
             confidence: found.confidence,
             light: found.estimate.light,
-            mask_dilation_px: found.estimate.dilation.map(|by| by * picture.pixels_on_disk(self.on.side)),
+            mask: MadeRight::of(&found.estimate, picture.pixels_on_disk(self.on.side)),
             rival: found.estimate.rival().map(rival),
             searches: found.searches,
             start: found.estimate.ranking[0].start,

@@ -8,7 +8,7 @@ use clap::Args;
 use glam::DMat4;
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::{Delay, Frame, ImageFormat, RgbImage};
-use sigma_srn::{Intrinsics, Model, write_atomically};
+use sigma_srn::{Intrinsics, Model, Outline, write_atomically};
 use srn_data::formats::mask_in;
 use srn_data::srn::{self, picture_size};
 use srn_data::target::{MARGIN, Target};
@@ -137,8 +137,8 @@ pub struct Picture {
     pub weights: Option<Vec<f32>>,
     /// How much of each pixel is the object `[side, side]`, where it was cut out; the rest of it is white.
     pub coverage: Option<Vec<f32>>,
-    /// By how many of these pixels its outline is known to be too far in; see [`sigma_srn::Query::dilation`].
-    pub dilation: f64,
+    /// How its mask is known to be wrong, in these pixels; see [`sigma_srn::Query::outline`].
+    pub outline: Outline,
     /// Intrinsics of the resampled picture.
     pub intrinsics: Intrinsics,
     /// Its true `world_from_camera`, if known.
@@ -190,7 +190,7 @@ impl Picture {
             rgb: target.rgb,
             weights: target.weights,
             coverage: target.coverage,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             intrinsics: Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 },
             truth: None,
             distance: target.cut.then(|| fx * SPAN * (1.0 + 2.0 * MARGIN) / f64::from(side)),

@@ -7,6 +7,7 @@ pub mod estimate;
 pub mod evaluate;
 mod files;
 mod heldout;
+mod mask;
 mod notation;
 mod outline;
 mod record;

@@ -9,6 +9,7 @@ use srn_data::sheet::{self, BLACK, CURVES, Colour, Curve};
 
 use super::draw;
 use super::files::{Picture, write_gif, write_png};
+use super::mask::MadeRight;
 use super::search::{On, PoseError, render};
 use crate::common::Result;
 
@@ -147,9 +148,7 @@ impl Page<'_> {
         let rgb = self.counted(&self.picture.rgb, [-0.2, -0.2, 0.2]);
         let mut captions = vec!["the picture given".into()];
         captions.extend(self.picture.weights.as_ref().map(|_| "blue-grey: masked out".into()));
-        let dilation = self.found.estimate.dilation.map(|by| by * self.picture.pixels_on_disk(self.side));
-        let outline = |by: f64| format!("mask {:.1} px too {}", by.abs(), if by < 0.0 { "large" } else { "small" });
-        captions.extend(dilation.filter(|by| *by != 0.0).map(outline));
+        captions.extend(MadeRight::of(&self.found.estimate, self.picture.pixels_on_disk(self.side)).captions());
         Panel { heading: "TARGET".into(), view: draw::view(&rgb, self.side, SHOWN), captions }
     }
 

@@ -279,7 +279,7 @@ pub fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
         rgb: picture.rgb.clone(),
         weights: picture.weights.clone(),
         coverage: picture.coverage.clone(),
-        dilation: picture.dilation,
+        outline: picture.outline,
         width: side,
         height: side,
         intrinsics: picture.intrinsics,
@@ -337,7 +337,7 @@ mod tests {
     use super::*;
     use clap::Parser;
     use glam::DVec3;
-    use sigma_srn::{Intrinsics, ModelConfig};
+    use sigma_srn::{Intrinsics, ModelConfig, Outline};
 
     #[derive(Parser)]
     struct Flags {
@@ -353,7 +353,7 @@ mod tests {
             rgb: vec![],
             weights: None,
             coverage: None,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             intrinsics,
             truth: None,
             square,

@@ -404,7 +404,7 @@ impl Bench<'_> {
 mod tests {
     use super::*;
     use glam::DMat4;
-    use sigma_srn::Intrinsics;
+    use sigma_srn::{Intrinsics, Outline};
 
     #[test]
     fn few_views_come_from_all_instances_and_places() {
@@ -415,7 +415,7 @@ mod tests {
             rgb: vec![],
             weights: None,
             coverage: None,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             intrinsics,
             truth: None,
             distance: None,

@@ -9,6 +9,7 @@ use srn_data::pixels::{ENDINGS, is_picture};
 
 use super::draw;
 use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side, warn_of_turned};
+use super::mask::MadeRight;
 use super::notation::NotationArgs;
 use super::search::{PoseError, SearchArgs, Starts, deviation, query, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
@@ -72,8 +73,9 @@ struct FrameReport<'a> {
     confidence: Option<Confidence>,
     /// The pose is not from that of the frame before, but was searched for all around.
     searched: bool,
-    /// By how many pixels of the frame its mask was dilated: below zero where it was too large.
-    mask_dilation_px: Option<f64>,
+    /// How its mask was made right.
+    #[serde(flatten)]
+    mask: MadeRight,
     error: Option<PoseError>,
     seconds: f64,
 }
@@ -130,7 +132,7 @@ pub fn run(args: &Track) -> Result<bool> {
         let frame = query(&picture, side, &starts);
         let Tracked { found, is_searched: searched } = with_cooperative_said(&engine, || Ok(tracker.next(frame, |_| Ok(()))?))?;
         trusted = found.is_trusted();
-        let dilation = found.estimate.dilation.map(|by| by * picture.pixels_on_disk(side));
+        let mask = MadeRight::of(&found.estimate, picture.pixels_on_disk(side));
         let truth = args.truth.as_ref().map(|truth| truth.read(&path, &notation)).transpose()?;
         let error = truth.map(|truth| notation.error(PoseError::of(&found.world_from_camera, &truth)));
         errors.extend(error);
@@ -152,7 +154,7 @@ pub fn run(args: &Track) -> Result<bool> {
             doubt: found.doubt,
             confidence: found.confidence.map(|confidence| notation.confidence(confidence)),
             searched,
-            mask_dilation_px: dilation,
+            mask,
             error,
             seconds: found.seconds,
         };

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use glam::DMat4;
-use sigma_srn::{Error, Found, Intrinsics, Model, Progress};
+use sigma_srn::{Error, Found, Intrinsics, Model, Outline, Progress};
 use srn_data::LoadedView;
 use srn_data::srn::SrnSet;
 
@@ -70,8 +70,8 @@ pub fn search(
         let of = |(picture, truth)| args.starts(starts, on.model, picture, on.side, Some(truth), notation);
         all_starts.push(pictures.iter().zip(truths).map(of).collect::<Result<Vec<_>>>()?);
     }
-    // Views of data sets have no masks to be dilated.
-    let steps: u64 = search.tries[0].phases.iter().filter(|phase| !phase.dilate).map(|phase| u64::from(phase.steps)).sum();
+    // Views of data sets have no masks to be made right.
+    let steps: u64 = search.tries[0].phases.iter().filter(|phase| !phase.outlines).map(|phase| u64::from(phase.steps)).sum();
     let bar = progress(steps * asked.len() as u64, "steps");
     let mut found = Vec::new();
     for (i, (Views { name, pictures, .. }, starts)) in asked.iter().zip(&all_starts).enumerate() {
@@ -101,7 +101,7 @@ pub fn picture(view: LoadedView, instance: u32, side: u32) -> (Picture, DMat4) {
             rgb,
             weights: None,
             coverage: None,
-            dilation: 0.0,
+            outline: Outline::AS_GIVEN,
             intrinsics,
             truth: Some(truth),
             distance: None,

@@ -22,7 +22,7 @@ use crate::confidence::{motion, promise};
 use crate::descent::{Descent, Method};
 use crate::engine::{Engine, proof};
 use crate::light::Light;
-use crate::mask::{DILATIONS, best_dilation};
+use crate::mask::{Outline, best_outline, outlines};
 use crate::model::Model;
 use crate::random::{initial_depths, stream};
 
@@ -70,9 +70,9 @@ pub struct Estimate {
     pub curvature: Option<[[f64; 6]; 6]>,
     /// The light of the image, if the last phase has made up for it.
     pub light: Option<Light>,
-    /// By how many pixels the mask of the image was dilated at the end, if it has an outline: below zero where it was too large.
-    pub dilation: Option<f64>,
-    /// The image as it was compared at the end, dilated and in the model's light `[height, width, 3]`.
+    /// How the outline of the image's mask was moved at the end, if it has one.
+    pub outline: Option<Outline>,
+    /// The image as it was compared at the end, with this outline and in the model's light `[height, width, 3]`.
     pub target: Vec<f32>,
     /// Pixels per row of it.
     pub width: u32,
@@ -107,14 +107,14 @@ struct Hypothesis {
     /// By how much that promises a lower loss.
     promise: f64,
     phases: usize,
-    /// Of the image's mask, in the running phase.
-    dilation: f64,
+    /// How the outline of the image's mask is moved, in the running phase.
+    outline: Outline,
 }
 
 impl Hypothesis {
     /// Of a start, which has been in no phase yet.
-    fn new(query: usize, start: usize, pose: Pose6, dilation: f64) -> Self {
-        Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, promise: 0.0, phases: 0, dilation }
+    fn new(query: usize, start: usize, pose: Pose6, outline: Outline) -> Self {
+        Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, promise: 0.0, phases: 0, outline }
     }
 }
 
@@ -134,7 +134,7 @@ pub fn estimate(
     let (model, queries) = (&*model, &*queries);
     let mut hypotheses = Vec::new();
     for (number, query) in queries.iter().enumerate() {
-        let new = |(start, matrix)| Hypothesis::new(number, start, Pose6::from_matrix(matrix), query.dilation);
+        let new = |(start, matrix)| Hypothesis::new(number, start, Pose6::from_matrix(matrix), query.outline);
         hypotheses.extend(query.all_starts(options).iter().enumerate().map(new));
     }
     prove(engine, model, queries, options, &hypotheses)?;
@@ -200,8 +200,8 @@ struct Course<'a, F> {
     last: Option<usize>,
     /// Of each query, as the last phase made up for it.
     lights: Vec<Option<Light>>,
-    /// By how much the mask of each query is dilated, if it has an outline.
-    dilations: Vec<Option<f64>>,
+    /// How the outline of each query's mask is moved, if it has one.
+    outlines: Vec<Option<Outline>>,
     step: u32,
     steps: u32,
     observe: F,
@@ -209,7 +209,7 @@ struct Course<'a, F> {
 
 impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
     fn new(engine: &'a Engine, model: &'a Model, queries: &'a [Query], options: &'a Options, observe: F) -> Self {
-        let runs = |phase: &&Phase| !phase.dilate || queries.iter().any(Query::can_dilate);
+        let runs = |phase: &&Phase| !phase.outlines || queries.iter().any(Query::has_outline);
         Course {
             engine,
             model,
@@ -217,7 +217,7 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
             options,
             last: options.phases.iter().rposition(|phase| runs(&phase)),
             lights: vec![None; queries.len()],
-            dilations: queries.iter().map(|query| query.can_dilate().then_some(query.dilation)).collect(),
+            outlines: queries.iter().map(|query| query.has_outline().then_some(query.outline)).collect(),
             step: 0,
             steps: options.phases.iter().filter(runs).map(|phase| phase.steps).sum(),
             observe,
@@ -232,16 +232,16 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
             return Ok(rest);
         }
         self.follow(phase, Some(number) == self.last, &mut running)?;
-        running.iter_mut().for_each(|h| h.phases = number + 1);
-        if phase.dilate {
-            running = self.best_dilated(&running);
+        if phase.outlines {
+            running = self.with_best_outlines(&running);
         }
+        running.iter_mut().for_each(|h| h.phases = number + 1);
         running.extend(rest);
-        running.iter_mut().for_each(|h| h.dilation = self.dilations[h.query].unwrap_or(0.0));
+        running.iter_mut().for_each(|h| h.outline = self.outline(h.query));
         Ok(running)
     }
 
-    /// Those that enter a phase, of each query the best first, with each dilation where those are tried; and those that are dropped, or wait.
+    /// Those that enter a phase, of each query the best first, with each outline where those are tried; and those that are dropped, or wait.
     fn entering(&self, number: usize, hypotheses: &[Hypothesis]) -> (Vec<Hypothesis>, Vec<Hypothesis>) {
         let phase = &self.options.phases[number];
         let (mut running, mut rest) = (Vec::new(), Vec::new());
@@ -252,13 +252,13 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
             if phase.keep < usize::MAX {
                 rest.extend(split_off_met(&mut own));
             }
-            let keep = if phase.dilate && !query.can_dilate() { 0 } else { phase.keep };
-            let rival = if phase.dilate { None } else { take_rival(&mut own, keep, phase.stride) };
+            let keep = if phase.outlines && !query.has_outline() { 0 } else { phase.keep };
+            let rival = if phase.outlines { None } else { take_rival(&mut own, keep, phase.stride) };
             let mut others = own.split_off(keep.min(own.len()));
             own.extend(rival);
-            if phase.dilate {
+            if phase.outlines {
                 others.iter_mut().for_each(|h| h.phases = number + 1);
-                own = own.iter().flat_map(|&h| DILATIONS.map(|by| Hypothesis { dilation: h.dilation + by, ..h })).collect();
+                own = own.iter().flat_map(|&h| outlines().map(move |by| Hypothesis { outline: h.outline + by, ..h })).collect();
             }
             running.extend(own);
             rest.extend(others);
@@ -267,19 +267,23 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         (running, rest)
     }
 
-    /// Finds the dilation of each query that leaves the least loss, and of each start the hypothesis whose own is nearest to it.
-    fn best_dilated(&mut self, tried: &[Hypothesis]) -> Vec<Hypothesis> {
+    fn outline(&self, query: usize) -> Outline {
+        self.outlines[query].unwrap_or_default()
+    }
+
+    /// Finds the outline of each query that leaves the least loss, and of each start the hypothesis whose own is nearest to it.
+    fn with_best_outlines(&mut self, tried: &[Hypothesis]) -> Vec<Hypothesis> {
         // Those of one start come one after the other.
-        let of_starts = || tried.chunks(DILATIONS.len());
+        let of_starts = || tried.chunks(outlines().count());
         let least = |tried: &&[Hypothesis]| tried.iter().map(|h| h.loss).fold(f64::INFINITY, f64::min);
-        for (number, (query, dilation)) in zip(self.queries, &mut self.dilations).enumerate() {
+        for number in 0..self.queries.len() {
             let own = of_starts().filter(|tried| tried[0].query == number);
-            let best = own.min_by(|a, b| least(a).total_cmp(&least(b)));
-            let per_area = |h: &Hypothesis| h.loss / query.area(h.dilation);
-            let by = best.map(|tried| best_dilation(&tried.iter().map(per_area).collect::<Vec<_>>()));
-            *dilation = dilation.map(|given| given + by.unwrap_or(0.0));
+            let Some(best) = own.min_by(|a, b| least(a).total_cmp(&least(b))) else { continue };
+            let per_area = |h: &Hypothesis| h.loss / self.queries[number].area(h.outline);
+            let losses: Vec<f64> = best.iter().map(per_area).collect();
+            self.outlines[number] = Some(best[0].outline + best_outline(&losses));
         }
-        let apart = |h: &&Hypothesis| (h.dilation - self.dilations[h.query].unwrap_or(0.0)).abs();
+        let apart = |h: &&Hypothesis| (h.outline + self.outline(h.query) * -1.0).length();
         let nearest = |tried: &[Hypothesis]| tried.iter().min_by(|a, b| apart(a).total_cmp(&apart(b))).copied();
         of_starts().filter_map(nearest).collect()
     }
@@ -300,8 +304,9 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         own.sort_by(|a, b| b.phases.cmp(&a.phases).then(a.loss.total_cmp(&b.loss)));
         let ranked = |h: &&Hypothesis| Ranked { start: h.start, loss: h.loss, phases: h.phases, pose: h.pose };
         let &Hypothesis { pose, loss, curvature, .. } = own[0];
-        let (light, dilation, query) = (self.lights[query], self.dilations[query], &self.queries[query]);
-        let (rgb, coverage) = query.seen(dilation.unwrap_or(0.0));
+        let (light, outline, of_query) = (self.lights[query], self.outlines[query], query);
+        let query = &self.queries[query];
+        let (rgb, coverage) = query.seen(self.outline(of_query));
         let mut target = rgb.into_owned();
         if let Some(light) = light {
             light.undo(&mut target, &coverage);
@@ -309,7 +314,7 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         let width = query.width;
         let extent = query.intrinsics.fx / (pose.distance() * f64::from(width));
         let ranking = own.iter().map(ranked).collect();
-        Estimate { pose, loss, curvature, light, dilation, target, width, extent, ranking }
+        Estimate { pose, loss, curvature, light, outline, target, width, extent, ranking }
     }
 
     /// Takes hypotheses through a phase, those of a query one after the other, the best first. What second derivatives say at its end is found out where
@@ -437,7 +442,7 @@ mod tests {
         let poses = [truth, turned(9e-4), turned(1.5e-3), shifted(9e-4), shifted(2e-3), turned(1.6e-3), turned(3.0)];
         let new = |(start, pose)| {
             let pose = Pose6::from_matrix(pose);
-            Hypothesis { loss: start as f64, phases: 1, ..Hypothesis::new(0, start, pose, 0.0) }
+            Hypothesis { loss: start as f64, phases: 1, ..Hypothesis::new(0, start, pose, Outline::AS_GIVEN) }
         };
         let mut own: Vec<Hypothesis> = poses.iter().enumerate().map(new).collect();
         own.push(Hypothesis { pose: Pose6([f64::NAN; 6]), start: 7, loss: f64::INFINITY, ..own[0] });
@@ -451,7 +456,7 @@ mod tests {
         let truth = crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
         let new = |(start, (degrees, loss)): (usize, (f64, f64))| {
             let pose = Pose6::from_matrix(&(DMat4::from_axis_angle(glam::DVec3::Y, f64::to_radians(degrees)) * truth));
-            Hypothesis { loss, phases: 1, ..Hypothesis::new(0, start, pose, 0.0) }
+            Hypothesis { loss, phases: 1, ..Hypothesis::new(0, start, pose, Outline::AS_GIVEN) }
         };
         let own = [(0.0, 1.0), (3.0, 1.1), (14.0, 1.2), (20.0, 1.5), (180.0, 1.9), (170.0, 2.1)];
         let own: Vec<Hypothesis> = own.into_iter().enumerate().map(new).collect();
@@ -476,7 +481,7 @@ mod tests {
             loss,
             promise,
             phases,
-            ..Hypothesis::new(query, start, pose, 0.0)
+            ..Hypothesis::new(query, start, pose, Outline::AS_GIVEN)
         };
         // Of the images one has arrived; another's best, or what is beside its best, promises more; what another's dropped one promises counts no more.
         let all = [

@@ -22,10 +22,10 @@ pub struct Phase {
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`](crate::Query::coverage) is known: see [`Light`](crate::Light). From wrong
     /// poses the light looks wrong, too.
     pub light: bool,
-    /// Whether masks are tried dilated and eroded by up to two pixels beside [`Query::dilation`](crate::Query::dilation), where [`Query::coverage`](crate::Query::coverage) is known, with the
-    /// best `keep` hypotheses; later phases compare with the one that leaves the least loss, see [`Estimate::dilation`](crate::Estimate::dilation). Other hypotheses and
-    /// other images wait: none is dropped for it.
-    pub dilate: bool,
+    /// Whether outlines of masks are tried beside [`Query::outline`](crate::Query::outline), where [`Query::coverage`](crate::Query::coverage) is known, with the best `keep` hypotheses:
+    /// dilated and eroded by up to two pixels, and with three cut away on one side. Later phases compare with what leaves the least loss, see
+    /// [`Estimate::outline`](crate::Estimate::outline). Other hypotheses and other images wait: none is dropped for it.
+    pub outlines: bool,
 }
 
 /// How poses are estimated.
@@ -72,15 +72,15 @@ impl Options {
     /// BFGS: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the best few on
     /// all, until they stand still: the loss has minima side by side. Then once more with new second derivatives: where a valley is flat and
     /// full of kinks, those that steps have learnt leave a pose a tenth of a degree before its end. These two make up for the light, and before them masks
-    /// are tried dilated. And on so for those that have not arrived: most have, in a number of steps that would be too small for some.
+    /// are tried with other outlines. And on so for those that have not arrived: most have, in a number of steps that would be too small for some.
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents) = match effort {
             Effort::Fast => (84, [(6, 6), (6, 2), (5, 1), (5, 1), (3, 1)]),
             Effort::Normal => (84, [(8, 16), (8, 6), (6, 1), (16, 3), (6, 3)]),
             Effort::Exhaustive => (168, [(10, 64), (10, 20), (6, 6), (18, 6), (6, 6)]),
         };
-        let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, dilate: false }];
-        let phase = |((stride, light, dilate), (steps, keep))| Phase { steps, stride, keep, light, dilate };
+        let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, outlines: false }];
+        let phase = |((stride, light, outlines), (steps, keep))| Phase { steps, stride, keep, light, outlines };
         let kinds = [(4, false, false), (2, false, false), (2, true, true), (1, true, false), (1, true, false)];
         phases.extend(zip(kinds, descents).map(phase));
         Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, align: true, phases, anew: 6, seed: 0 }
@@ -93,29 +93,29 @@ impl Options {
             method,
             min_starts: 0,
             align: false,
-            phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, dilate: false }],
+            phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, outlines: false }],
             anew: 0,
             seed: 0,
         }
     }
 
-    /// The same with `steps` steps in all, none anew, shared between the phases in their present proportions; those that try dilations have as many more or fewer,
+    /// The same with `steps` steps in all, none anew, shared between the phases in their present proportions; those that try outlines have as many more or fewer,
     /// and come on top. Where there are any at all, a phase whose share is none is left out.
     pub fn with_steps(mut self, steps: u32) -> Self {
         self.anew = 0;
-        let total = self.phases.iter().filter(|phase| !phase.dilate).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
+        let total = self.phases.iter().filter(|phase| !phase.outlines).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
         let share = |of: u64| (2 * of * u64::from(steps) + total) / (2 * total);
         let (mut before, mut done) = (0, 0);
         self.phases.retain_mut(|phase| {
             let present = u64::from(phase.steps);
-            if phase.dilate {
+            if phase.outlines {
                 phase.steps = share(present) as u32;
             } else {
                 before += present;
                 phase.steps = (share(before) - done) as u32;
                 done = share(before);
             }
-            phase.steps > 0 || present == 0 || phase.dilate || steps == 0
+            phase.steps > 0 || present == 0 || phase.outlines || steps == 0
         });
         self
     }
@@ -130,7 +130,7 @@ impl Options {
     pub fn without_culling(mut self) -> Self {
         self.align = false;
         self.min_starts = 0;
-        self.phases.iter_mut().filter(|phase| !phase.dilate).for_each(|phase| phase.keep = usize::MAX);
+        self.phases.iter_mut().filter(|phase| !phase.outlines).for_each(|phase| phase.keep = usize::MAX);
         self
     }
 
@@ -158,13 +158,13 @@ mod tests {
     fn steps_keep_their_proportions() {
         let default = Options::default();
         // Pictures without a mask have no others.
-        let all = |options: &Options| options.phases.iter().filter(|phase| !phase.dilate).map(|phase| phase.steps).sum::<u32>();
+        let all = |options: &Options| options.phases.iter().filter(|phase| !phase.outlines).map(|phase| phase.steps).sum::<u32>();
         for steps in [0, 1, 7, 250, 1000] {
             assert_eq!(all(&default.clone().with_steps(steps)), steps);
         }
         let total = all(&default);
         assert_eq!(default.clone().with_steps(total), Options { anew: 0, ..default.clone() });
-        // A look at all starts, dilations, and the phase that has the step.
+        // A look at all starts, outlines, and the phase that has the step.
         let one: Vec<(u32, u32)> = default.clone().with_steps(1).phases.iter().map(|phase| (phase.steps, phase.stride)).collect();
         assert_eq!(one, [(0, 4), (0, 2), (1, 1)]);
         assert_eq!(default.clone().with_steps(0).phases.len(), default.phases.len());
@@ -172,6 +172,6 @@ mod tests {
         assert_eq!(keeps(&Options::paper().with_culling()), [(60, usize::MAX), (240, 6)]);
         assert_eq!(default.clone().with_culling(), default);
         let all_to_the_end = default.with_stride(1).without_culling();
-        assert!(all_to_the_end.phases.iter().all(|phase| phase.stride == 1 && (phase.keep == usize::MAX || phase.dilate)));
+        assert!(all_to_the_end.phases.iter().all(|phase| phase.stride == 1 && (phase.keep == usize::MAX || phase.outlines)));
     }
 }

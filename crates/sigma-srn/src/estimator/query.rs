@@ -7,7 +7,7 @@ use glam::{DMat4, DVec2};
 use super::align::hidden_side;
 use super::options::{Options, Phase};
 use crate::camera::Intrinsics;
-use crate::mask::{DILATIONS, dilated, has_outline};
+use crate::mask::{Outline, has_outline, outlines, with_outline};
 use crate::model::Model;
 use crate::pixel_grid;
 
@@ -25,11 +25,10 @@ pub struct Query {
     /// the same. GMSD takes none.
     pub weights: Option<Vec<f32>>,
     /// How much of each pixel the object covers `[height, width]`, 0 to 1; the rest of it is white. Where it is known, a phase may make up
-    /// for the light of the image, see [`Phase::light`], and for an outline that is not exact, see [`Phase::dilate`].
+    /// for the light of the image, see [`Phase::light`], and for an outline that is not exact, see [`Phase::outlines`].
     pub coverage: Option<Vec<f32>>,
-    /// By how many pixels its outline is known to be too far in, or too far out where this is below zero: the search begins with the mask dilated by as
-    /// much. 0 where nothing is known.
-    pub dilation: f64,
+    /// How its outline is known to be wrong: the search begins with the mask made right by as much.
+    pub outline: Outline,
     /// Pixels per row.
     pub width: u32,
     /// Rows.
@@ -63,25 +62,25 @@ impl Query {
         weights.into_iter().map(|weight| weight / mean).collect()
     }
 
-    /// Colours, and how much the object covers (none where that is not known), with the mask dilated.
-    pub(crate) fn seen(&self, dilation: f64) -> (Cow<'_, [f32]>, Cow<'_, [f32]>) {
+    /// Colours, and how much the object covers (none where that is not known), with the mask made right.
+    pub(crate) fn seen(&self, outline: Outline) -> (Cow<'_, [f32]>, Cow<'_, [f32]>) {
         match &self.coverage {
-            Some(coverage) if dilation != 0.0 => {
-                let (rgb, coverage) = dilated(&self.rgb, coverage, self.weights.as_deref(), self.width as usize, dilation);
+            Some(coverage) if outline != Outline::AS_GIVEN => {
+                let (rgb, coverage) = with_outline(&self.rgb, coverage, self.weights.as_deref(), self.width as usize, outline);
                 (rgb.into(), coverage.into())
             }
             coverage => (self.rgb.as_slice().into(), coverage.as_deref().unwrap_or_default().into()),
         }
     }
 
-    /// How many of the pixels that count the object covers with its mask dilated.
-    pub(crate) fn area(&self, dilation: f64) -> f64 {
-        let (_, coverage) = self.seen(dilation);
+    /// How many of the pixels that count the object covers with its mask made right.
+    pub(crate) fn area(&self, outline: Outline) -> f64 {
+        let (_, coverage) = self.seen(outline);
         coverage.iter().enumerate().map(|(pixel, cover)| f64::from(cover * self.weight(pixel))).sum()
     }
 
-    /// Whether the mask has an outline that dilations change.
-    pub(crate) fn can_dilate(&self) -> bool {
+    /// Whether the mask has an outline that may be wrong.
+    pub(crate) fn has_outline(&self) -> bool {
         self.coverage.as_ref().is_some_and(|coverage| has_outline(coverage, self.weights.as_deref()))
     }
 
@@ -100,7 +99,7 @@ impl Query {
     pub(crate) fn most_rays(&self, options: &Options) -> usize {
         let starts = self.all_starts(options).len();
         let rays = |phase: &Phase| {
-            let tried = if phase.dilate { DILATIONS.len() } else { 1 };
+            let tried = if phase.outlines { outlines().count() } else { 1 };
             tried * starts.min(phase.keep) * self.rays(phase.stride).count()
         };
         options.phases.iter().map(rays).max().unwrap_or(0)
@@ -129,8 +128,9 @@ impl Query {
             return Err(format!("needs a coverage of {pixels} values from 0 to 1"));
         }
         let side = f64::from(width.max(height));
-        if self.dilation.is_nan() || self.dilation.abs() > side {
-            return Err(format!("a mask dilated by {} pixels, where the image has {side}", self.dilation));
+        let Outline { dilation, cut } = self.outline;
+        if let Some(by) = [dilation, cut.x, cut.y].into_iter().find(|by| by.is_nan() || by.abs() > side) {
+            return Err(format!("a mask whose outline is {by} pixels off, where the image has {side}"));
         }
         if let Some(weights) = &self.weights {
             if weights.len() != pixels || weights.iter().any(|weight| !(0.0..f32::INFINITY).contains(weight)) {

@@ -41,7 +41,7 @@ impl Targets {
             let query = &queries[hypothesis.query];
             slots.push(instances.binary_search(&query.instance).expect("collected above") as u32);
             rays.push(&DMat4::IDENTITY, &query.intrinsics, query.rays(phase.stride), &mut random);
-            let (colours, _) = query.seen(hypothesis.dilation);
+            let (colours, _) = query.seen(hypothesis.outline);
             query.pixels(phase.stride).for_each(|pixel| rgb.extend_from_slice(&colours[3 * pixel..][..3]));
             weights.extend(query.ray_weights(phase.stride));
         }
@@ -69,7 +69,7 @@ impl Targets {
         let values = 3 * self.rays_per_image();
         for ((hypothesis, render), rgb) in zip(running, renders.chunks(values)).zip(self.rgb.chunks_mut(values)) {
             let query = &queries[hypothesis.query];
-            let (_, coverage) = query.seen(hypothesis.dilation);
+            let (_, coverage) = query.seen(hypothesis.outline);
             if query.coverage.is_some() {
                 let coverage: Vec<f32> = query.pixels(stride).map(|pixel| coverage[pixel]).collect();
                 let between = || Light::between(rgb, render, &coverage, &query.ray_weights(stride));
