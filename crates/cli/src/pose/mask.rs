@@ -31,7 +31,8 @@ impl MadeRight {
                 by => Some(if by < 0.0 { before } else { beyond }),
             };
             let sides = side(v, "top", "bottom").into_iter().chain(side(u, "left", "right"));
-            format!("{:.1} px cut off at the {}", u.hypot(v), sides.collect::<Vec<_>>().join(" "))
+            // Short, for a panel is narrow.
+            format!("{}: {:.1} px cut", sides.collect::<Vec<_>>().join(" "), u.hypot(v))
         };
         let dilated = self.mask_dilation_px.filter(|by| *by != 0.0).map(outline);
         let cut = self.mask_cut_px.filter(|by| *by != [0.0; 2]).map(cut);
