@@ -1,14 +1,13 @@
-//! How sure an estimate is. The second derivatives `B` of the loss say how a pose error shows in the picture, and so in which
-//! directions it can hide. The renderer does not know the object exactly; how far off that leaves the poses, only known ones can tell.
+//! How far off a pose may be.
 
 use std::collections::BTreeMap;
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
-use crate::estimator::{Estimate, Ranked};
-use crate::model::{Metadata, Model};
-use crate::unseen::Unseen;
+use crate::confidence::Calibration;
+use crate::estimator::Estimate;
+use crate::model::Model;
 
 /// A symmetric matrix over a motion, see [`motion`].
 pub type Matrix6 = [[f64; 6]; 6];
@@ -22,75 +21,6 @@ pub struct Known {
     pub motion: [f64; 6],
     /// See [`Estimate::shape`].
     pub shape: Matrix6,
-}
-
-/// What estimates of known poses told of a model.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Calibration {
-    /// The covariance of an estimate is this times `loss · B⁻¹`,
-    pub curvature: f64,
-    /// and these variances on its diagonal: what the errors of all estimates have in common;
-    pub floor: [f64; 6],
-    /// by instance, so many times both together, where the errors at one object tell of those at another view of it. Others: 1.
-    #[serde(default)]
-    pub sizes: BTreeMap<String, f64>,
-    /// Part of a picture that an estimate to be trusted leaves unexplained at most.
-    pub unexplained: f64,
-    /// By instance, the part of a picture that its true poses leave unexplained at most: the network knows one object better than another.
-    #[serde(default)]
-    pub at_truth: BTreeMap<String, f64>,
-    /// How many times that an estimate to be trusted leaves unexplained at most.
-    #[serde(default)]
-    pub above_truth: f64,
-    /// How much higher, as a part, the loss must be at the next best pose elsewhere for an estimate to be trusted.
-    pub rival: f64,
-    /// Number of estimates that this is from.
-    pub views: u32,
-    /// How large and how far away their objects were.
-    #[serde(default)]
-    pub seen: Option<Seen>,
-}
-
-/// How the estimates of a [`Calibration`] see their objects, the medians.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Seen {
-    /// Distance of the camera from the object's centre, object units.
-    pub distance: f64,
-    /// See [`Estimate::extent`].
-    pub extent: f64,
-}
-
-/// Why an estimate is not to be trusted.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Doubt {
-    /// The loss is no number.
-    Loss,
-    /// It leaves more of the picture unexplained than true poses do.
-    Unexplained,
-    /// The camera is nearer to the object, or farther from it, than the model knows, see [`Metadata::knows_distance`](crate::Metadata::knows_distance):
-    /// from close by, a part of one surface explains any picture of one colour, and what the network shows there is a guess.
-    Distance,
-    /// The object is less than half as large in the picture as in those that the model was calibrated with.
-    Small,
-    /// A pose elsewhere explains the picture nearly as well.
-    Rival,
-    /// It explains the picture by much of the object, and by nearly all of its outline, lying where the picture does not count: there may be
-    /// anything, and of what is left in sight many poses are right.
-    Hidden,
-}
-
-impl std::fmt::Display for Doubt {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Doubt::Loss => "the loss is no number",
-            Doubt::Unexplained => "too much is unexplained",
-            Doubt::Distance => "nearer or farther than the model knows",
-            Doubt::Small => "too small in the picture",
-            Doubt::Rival => "another pose does nearly as well",
-            Doubt::Hidden => "too much of the object lies behind the mask, its outline too",
-        })
-    }
 }
 
 /// How far off a pose may be, provided that it is no other one altogether.
@@ -114,42 +44,15 @@ impl Confidence {
     }
 }
 
-impl Calibration {
-    /// Why an estimate of this instance is not to be trusted, by what it leaves unexplained and by its rival, if there is one. An instance that
-    /// is not in `at_truth` is taken for one as good as half of those that are.
-    pub fn doubt(&self, instance: &str, unexplained: f64, rival_higher: Option<f64>) -> Option<Doubt> {
-        let mut all: Vec<f64> = self.at_truth.values().copied().collect();
-        all.sort_by(f64::total_cmp);
-        let most = self.at_truth.get(instance).or(all.get(all.len() / 2));
-        let is_explained = unexplained <= self.unexplained && most.is_none_or(|most| unexplained <= self.above_truth * most);
-        match rival_higher {
-            _ if !is_explained => Some(Doubt::Unexplained),
-            Some(higher) if higher < self.rival => Some(Doubt::Rival),
-            _ => None,
-        }
-    }
-
-    /// Whether an object is so small in a picture that these estimates say little of it.
-    pub fn is_small(&self, extent: f64) -> bool {
-        self.seen.is_some_and(|seen| 2.0 * extent < seen.extent)
-    }
-
-    /// [`Calibration::floor`] for an estimate. In a smaller picture of the object errors grow as a pixel does; and how far away it is, which
-    /// shows in how large it is, is known to a part of the distance.
-    fn floor_of(&self, estimate: &Estimate) -> [f64; 6] {
-        let Some(seen) = self.seen else { return self.floor };
-        let pixel = (seen.extent / estimate.extent).max(1.0);
-        let farther = (estimate.pose.distance() / seen.distance).max(1.0);
-        let [a, b, c, x, y, z] = self.floor.map(|variance| pixel * pixel * variance);
-        [a, b, c, x, y, farther * farther * z]
-    }
-}
-
 /// What the squared distance of six normal numbers from their mean, in units of their covariance, is below in 95 % of all cases.
 pub const WITHIN_95: f64 = 12.591_587;
 
-/// How far apart poses are that are not the same minimum: a turn about the object in degrees.
-const ELSEWHERE_DEG: f64 = 10.0;
+/// Where a mask says where the object ends: how much larger all variances are; by how many pixels the outline is still off when it has been
+/// found; and by which part of that, since what is cut away, or left on, is hardly the same all around (the latter two are standard deviations). By pictures
+/// whose masks were made wrong (`docs/accuracy.md`).
+const CUT_OUT: f64 = 2.0;
+const OUTLINE: f64 = 0.25;
+const OF_MOVED: f64 = 0.3;
 
 /// The motion `(ω, υ)` about the object that takes one pose to another, in the axes of the first one's camera: the camera turned about the
 /// object's centre by `ω` (radians), then shifted by `υ` (object units).
@@ -161,83 +64,19 @@ pub fn motion(from: &DMat4, to: &DMat4) -> [f64; 6] {
     [a, b, c, shift.x, shift.y, shift.z]
 }
 
-/// Where a mask says where the object ends: how much larger all variances are; by how many pixels the outline is still off when it has been
-/// found; and by which part of that, since what is cut away, or left on, is hardly the same all around (the latter two are standard deviations). By pictures
-/// whose masks were made wrong (`docs/accuracy.md`).
-const CUT_OUT: f64 = 2.0;
-const OUTLINE: f64 = 0.25;
-const OF_MOVED: f64 = 0.3;
-
-/// What a picture may leave unexplained where there is no calibration.
-const UNEXPLAINED: f64 = 0.25;
-/// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on (`docs/accuracy.md`).
-const UNSEEN_RIVAL: f64 = 0.3;
-
-/// The part of a picture `[height, width, 3]` that a view leaves unexplained: the sum of absolute differences, over that to a white picture, of
-/// the pixels that count (`weights`, `[height, width]`). 0: equal; 1: no better than nothing; not a number where one is in the view.
-pub fn unexplained(rgb: &[f32], weights: Option<&[f32]>, view: &[f32]) -> f64 {
-    let weight = |value: usize| weights.map_or(1.0, |weights| weights[value / 3]);
-    let sum = |difference: &dyn Fn(usize) -> f32| {
-        (0..rgb.len()).map(|value| f64::from(weight(value) * difference(value).abs())).sum::<f64>()
-    };
-    sum(&|value| rgb[value] - view[value].clamp(-1.0, 1.0)) / sum(&|value| rgb[value] - 1.0)
-}
-
-/// The doubt where more than `most` of a picture is [`unexplained`], also where that is no number.
-pub fn unexplained_doubt(unexplained: f64, most: f64) -> Option<Doubt> {
-    (unexplained.is_nan() || unexplained > most).then_some(Doubt::Unexplained)
-}
-
-/// How much darker than white a pixel is that shows an object, all channels together (they span 6).
-const SHOWN: f64 = 0.3;
-/// The part of an object that may lie where a picture does not count, where no more of its outline lies where it does. Of 80 searches for ten objects
-/// all around which nothing counted, right poses hid 0.03 to 0.13 of the object, wrong ones 0.11 to 0.77 (`docs/accuracy.md`).
-const HIDDEN: f64 = 0.1;
-
-/// The doubt where more than a tenth of what a view shows `[height, width, 3]` lies where a picture does not count (`weights`, `[height, width]`), and hardly
-/// any of its outline where it does.
-pub(crate) fn hidden_doubt(weights: &[f32], view: &[f32], width: usize) -> Option<Doubt> {
-    let counts = |pixel: usize| f64::from(weights[pixel].clamp(0.0, 1.0));
-    let darkness: Vec<f64> =
-        view.chunks_exact(3).map(|pixel| pixel.iter().map(|colour| f64::from(1.0 - colour.clamp(-1.0, 1.0))).sum()).collect();
-    let in_sight = (0..darkness.len()).map(|pixel| counts(pixel) * darkness[pixel]).sum::<f64>() / darkness.iter().sum::<f64>();
-    let is_object = |pixel: usize| darkness[pixel] > SHOWN;
-    let right = (1..darkness.len()).filter(|pixel| pixel % width != 0).map(|pixel| (pixel - 1, pixel));
-    let below = (width..darkness.len()).map(|pixel| (pixel - width, pixel));
-    let outline: Vec<f64> = right
-        .chain(below)
-        .filter(|&(one, other)| is_object(one) != is_object(other))
-        .map(|(one, other)| counts(one).min(counts(other)))
-        .collect();
-    let has_outline = outline.iter().sum::<f64>() > HIDDEN * outline.len() as f64;
-    (in_sight < 1.0 - HIDDEN && !has_outline).then_some(Doubt::Hidden)
+impl Calibration {
+    /// [`Calibration::floor`] for an estimate. In a smaller picture of the object errors grow as a pixel does; and how far away it is, which
+    /// shows in how large it is, is known to a part of the distance.
+    fn floor_of(&self, estimate: &Estimate) -> [f64; 6] {
+        let Some(seen) = self.seen else { return self.floor };
+        let pixel = (seen.extent / estimate.extent).max(1.0);
+        let farther = (estimate.pose.distance() / seen.distance).max(1.0);
+        let [a, b, c, x, y, z] = self.floor.map(|variance| pixel * pixel * variance);
+        [a, b, c, x, y, farther * farther * z]
+    }
 }
 
 impl Estimate {
-    /// Why it is not to be trusted, if it is not: an estimate for an instance of `model`, whose view from there leaves so much of
-    /// [`Estimate::target`] [`unexplained`]. Without a calibration a quarter may be.
-    pub fn doubt(&self, model: &Model, instance: u32, unexplained: f64) -> Option<Doubt> {
-        let picture = match &model.metadata.calibration {
-            Some(calibration) => {
-                calibration.doubt(&model.instance_name(instance), unexplained, self.rival().map(|(_, higher)| higher))
-            }
-            None => unexplained_doubt(unexplained, UNEXPLAINED),
-        };
-        self.doubt_besides(&model.metadata, picture)
-    }
-
-    /// The same, given what the picture says: the loss must be a number, and the object seen as the model knows it.
-    fn doubt_besides(&self, metadata: &Metadata, picture: Option<Doubt>) -> Option<Doubt> {
-        let is_unknown = !metadata.knows_distance(self.pose.distance());
-        let is_small = metadata.calibration.as_ref().is_some_and(|known| known.is_small(self.extent));
-        match picture {
-            _ if !self.loss.is_finite() => Some(Doubt::Loss),
-            None | Some(Doubt::Rival) if is_unknown => Some(Doubt::Distance),
-            None | Some(Doubt::Rival) if is_small => Some(Doubt::Small),
-            doubt => doubt,
-        }
-    }
-
     /// `loss · B⁻¹`, the shape of the estimate's errors. `None` without second derivatives, or where they are not those of a minimum.
     pub fn shape(&self) -> Option<Matrix6> {
         let lower = cholesky(self.curvature.as_ref()?)?;
@@ -263,25 +102,6 @@ impl Estimate {
     pub fn states(&self, pose: &DMat4, instance: &str, calibration: &Calibration) -> Option<bool> {
         let (_, squared) = distance(&self.covariance(instance, calibration)?, &motion(&self.pose.to_matrix(), pose))?;
         Some(squared <= WITHIN_95)
-    }
-
-    /// The best of the other starts that went as far as the winner, but to a pose elsewhere, and by which part its loss is higher.
-    pub fn rival(&self) -> Option<(&Ranked, f64)> {
-        let winner = self.ranking.first()?;
-        let is_rival = |other: &&Ranked| other.phases == winner.phases && winner.pose.degrees_from(other.pose) > ELSEWHERE_DEG;
-        let rival = self.ranking[1..].iter().find(is_rival)?;
-        Some((rival, rival.loss / self.loss - 1.0))
-    }
-}
-
-impl Unseen {
-    /// The same as [`Estimate::doubt`], for an object that `model` was not trained on: its code bends to the picture at a wrong pose too, so what
-    /// matters more than what is unexplained is whether the other known objects that it began with led to the same pose.
-    pub fn doubt(&self, model: &Model, unexplained: f64) -> Option<Doubt> {
-        let most = model.metadata.calibration.as_ref().map_or(UNEXPLAINED, |calibration| calibration.unexplained);
-        let has_rival = self.estimate.rival().is_some_and(|(_, higher)| higher < UNSEEN_RIVAL);
-        let picture = unexplained_doubt(unexplained, most).or(has_rival.then_some(Doubt::Rival));
-        self.estimate.doubt_besides(&model.metadata, picture)
     }
 }
 
@@ -415,35 +235,11 @@ fn forward(lower: &Matrix6, mut x: [f64; 6]) -> [f64; 6] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::camera::{Pose6, look_at_origin};
+    use crate::camera::look_at_origin;
+    use crate::confidence::Seen;
+    use crate::confidence::tests::{calibration, curvature, estimate};
     use crate::mask::Outline;
-    use crate::model::ModelConfig;
     use crate::random::{normal, stream};
-
-    /// A positive matrix with unlike scales.
-    fn curvature() -> Matrix6 {
-        let factor: Matrix6 =
-            std::array::from_fn(|i| std::array::from_fn(|j| ((3 * i + 5 * j) % 7) as f64 - 3.0 + if i == j { 9.0 } else { 0.0 }));
-        std::array::from_fn(|i| std::array::from_fn(|j| (0..6).map(|k| factor[i][k] * factor[j][k]).sum()))
-    }
-
-    fn estimate(pose: DMat4) -> Estimate {
-        let pose = Pose6::from_matrix(&pose);
-        let ranked = |start, loss, pose| Ranked { start, loss, phases: 4, pose };
-        let turned = Pose6::from_matrix(&(DMat4::from_rotation_z(1.0) * pose.to_matrix()));
-        let ranking = vec![ranked(7, 2.0, pose), ranked(3, 2.1, pose), ranked(5, 3.0, turned)];
-        Estimate {
-            pose,
-            loss: 2.0,
-            curvature: Some(curvature()),
-            light: None,
-            outline: None,
-            target: vec![],
-            width: 64,
-            extent: 0.5,
-            ranking,
-        }
-    }
 
     #[test]
     fn second_derivatives_promise_what_the_way_to_the_minimum_brings() {
@@ -454,89 +250,6 @@ mod tests {
         assert!((promise(&curvature(), &gradient) / brings - 1.0).abs() < 1e-12);
         let saddle: Matrix6 = std::array::from_fn(|i| std::array::from_fn(|j| if i != j { 0.0 } else { 2.0 - i as f64 }));
         assert_eq!([promise(&saddle, &gradient), promise(&[[f64::NAN; 6]; 6], &gradient)], [0.0; 2]);
-    }
-
-    #[test]
-    fn an_object_of_which_much_is_hidden_is_trusted_by_its_outline() {
-        // A grey square of 8 × 8 pixels in the middle of 16 × 16.
-        let inside =
-            |pixel: usize, first: usize, last: usize| [pixel % 16, pixel / 16].map(|x| (first..last).contains(&x)) == [true; 2];
-        let view: Vec<f32> = (0..3 * 256).map(|value| if inside(value / 3, 4, 12) { 0.0 } else { 1.0 }).collect();
-        let doubt = |counts: &dyn Fn(usize) -> bool| {
-            let weights: Vec<f32> = (0..256).map(|pixel| if counts(pixel) { 1.0 } else { 0.0 }).collect();
-            hidden_doubt(&weights, &view, 16)
-        };
-        // All of it and nothing else; all but a rim of it; its left half, with what is around it, and without.
-        assert_eq!(doubt(&|pixel| inside(pixel, 4, 12)), None);
-        assert_eq!(doubt(&|pixel| inside(pixel, 5, 11)), Some(Doubt::Hidden));
-        assert_eq!(doubt(&|pixel| pixel % 16 < 8), None);
-        assert_eq!(doubt(&|pixel| inside(pixel, 4, 12) && pixel % 16 < 8), Some(Doubt::Hidden));
-        // An object that fills the picture has no outline there.
-        assert_eq!(hidden_doubt(&[1.0, 1.0, 0.0, 1.0], &[0.0; 12], 2), Some(Doubt::Hidden));
-        assert_eq!(hidden_doubt(&[1.0; 4], &[0.0; 12], 2), None);
-    }
-
-    #[test]
-    fn an_estimate_is_trusted_by_what_its_object_allows() {
-        let at_truth = [("well", 0.1), ("usual", 0.2), ("badly", 0.5)].map(|(name, most)| (name.to_string(), most));
-        let known = Calibration {
-            unexplained: 0.9,
-            at_truth: at_truth.into(),
-            above_truth: 1.5,
-            rival: 0.1,
-            ..calibration(1.0, [1.0; 6])
-        };
-        let cases =
-            [("well", 0.14, true), ("well", 0.16, false), ("badly", 0.7, true), ("new", 0.29, true), ("new", 0.31, false)];
-        for (instance, unexplained, trusted) in cases {
-            let doubt = (!trusted).then_some(Doubt::Unexplained);
-            assert_eq!(known.doubt(instance, unexplained, None), doubt, "{instance} {unexplained}");
-        }
-        assert_eq!([0.2, 0.05].map(|higher| known.doubt("well", 0.1, Some(higher))), [None, Some(Doubt::Rival)]);
-        assert_eq!(known.doubt("well", f64::NAN, Some(0.05)), Some(Doubt::Unexplained));
-        let old = Calibration { at_truth: BTreeMap::new(), ..known };
-        assert_eq!([0.8, 1.0].map(|part| old.doubt("well", part, None)), [None, Some(Doubt::Unexplained)]);
-    }
-
-    #[test]
-    fn a_pose_is_trusted_where_nothing_speaks_against_it() {
-        let config = ModelConfig { hidden: 4, latent: 2, instances: 1, tracing_steps: 1, density: true };
-        let plain = Model::init(&config, 0).unwrap();
-        let model = |calibration: Option<Calibration>| {
-            let metadata = Metadata { ray_sphere: Some(1.3), calibration, ..plain.metadata.clone() };
-            Model { metadata, ..plain.clone() }
-        };
-        let seen = Some(Seen { distance: 1.3, extent: 0.5 });
-        let calibrated = model(Some(Calibration { unexplained: 0.5, rival: 0.4, seen, ..calibration(1.0, [1.0; 6]) }));
-        let strict = model(Some(Calibration { unexplained: 0.5, rival: 0.6, seen, ..calibration(1.0, [1.0; 6]) }));
-        let at = |distance: f64| estimate(look_at_origin(DVec3::new(0.0, distance, 0.0)));
-        let small = Estimate { extent: 0.2, ..at(1.3) };
-        let broken = Estimate { loss: f64::INFINITY, ..at(1.3) };
-        // A rival's loss is half as much higher.
-        for (model, estimate, part, doubt) in [
-            (&calibrated, at(1.3), 0.4, None),
-            (&calibrated, at(1.3), 0.6, Some(Doubt::Unexplained)),
-            (&calibrated, at(0.6), 0.4, Some(Doubt::Distance)),
-            (&calibrated, at(0.6), 0.6, Some(Doubt::Unexplained)),
-            (&calibrated, small.clone(), 0.4, Some(Doubt::Small)),
-            (&calibrated, broken, 0.4, Some(Doubt::Loss)),
-            (&strict, at(1.3), 0.4, Some(Doubt::Rival)),
-            (&strict, small.clone(), 0.4, Some(Doubt::Small)),
-            (&model(None), at(1.3), 0.2, None),
-            (&model(None), small, 0.2, None),
-            (&model(None), at(1.3), 0.3, Some(Doubt::Unexplained)),
-            (&model(None), at(0.6), 0.2, Some(Doubt::Distance)),
-        ] {
-            assert_eq!(estimate.doubt(model, 0, part), doubt, "{part} {:?}", estimate.pose);
-        }
-        // Of an object that the model does not know other limits hold.
-        let unseen = |higher: f64| {
-            let mut estimate = at(1.3);
-            estimate.ranking[2].loss = (1.0 + higher) * estimate.loss;
-            Unseen { estimate, model: plain.clone(), nearest: 0 }
-        };
-        assert_eq!([0.2, 0.4].map(|higher| unseen(higher).doubt(&strict, 0.4)), [Some(Doubt::Rival), None]);
-        assert_eq!([&strict, &model(None)].map(|model| unseen(0.4).doubt(model, 0.4)), [None, Some(Doubt::Unexplained)]);
     }
 
     /// Where a picture shows the object smaller than those of the calibration, all errors grow; where it is farther away, that along the view.
@@ -572,11 +285,6 @@ mod tests {
             let outline = Outline { dilation, ..Outline::AS_GIVEN };
             assert_eq!(variances(Some(outline)), [2e8, 2e8, (2e8 + 1e12 * along * along).round()], "{dilation}");
         }
-    }
-
-    fn calibration(curvature: f64, floor: [f64; 6]) -> Calibration {
-        let (sizes, at_truth) = (BTreeMap::new(), BTreeMap::new());
-        Calibration { curvature, floor, sizes, unexplained: 1.0, at_truth, above_truth: 0.0, rival: 0.0, views: 1, seen: None }
     }
 
     #[test]
@@ -691,23 +399,5 @@ mod tests {
         // One ellipsoid for all would leave most of them out.
         let alike = (found.0, found.1, BTreeMap::new());
         assert!(share(&alike, &of(true)) < 0.75, "{}", share(&alike, &of(true)));
-    }
-
-    #[test]
-    fn a_rival_is_elsewhere() {
-        let estimate = estimate(look_at_origin(DVec3::new(1.0, -0.6, 0.5)));
-        let (rival, higher) = estimate.rival().unwrap();
-        assert_eq!((rival.start, higher), (5, 0.5));
-    }
-
-    #[test]
-    fn unexplained_is_relative_to_an_empty_picture() {
-        let picture = [0.5, 1.0, -0.5];
-        assert_eq!(unexplained(&picture, None, &picture), 0.0);
-        assert_eq!(unexplained(&picture, None, &[1.0, 1.7, 1.0]), 1.0);
-        assert_eq!(unexplained(&picture, None, &[0.5, 1.0, -1.5]), 0.25);
-        assert!(unexplained(&picture, None, &[0.5, f32::NAN, -0.5]).is_nan() && unexplained(&[1.0; 3], None, &[1.0; 3]).is_nan());
-        let two = [0.5, 1.0, -0.5, -1.0, -1.0, -1.0];
-        assert_eq!(unexplained(&two, Some(&[1.0, 0.0]), &[0.5, 1.0, -1.5, 1.0, 1.0, 1.0]), 0.25);
     }
 }
