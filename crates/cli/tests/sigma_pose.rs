@@ -191,6 +191,15 @@ fn a_calibrated_model_states_deviations() {
     let confidence = &report["images"][0]["confidence"];
     assert_eq!(confidence["covariance"].as_array().unwrap().len(), 6);
     assert!(confidence["rotation_deg"].as_f64().unwrap() > 0.0 && report["images"][0]["trusted"] == true, "{report}");
+    let elsewhere = fs::read_to_string(format!("{TEST}/chicken/pose/000009.txt")).unwrap().replace('\n', " ");
+    fs::write(dir.join("elsewhere.txt"), elsewhere).unwrap();
+    let within_95 = |args: &str| {
+        let report: Value = serde_json::from_str(&estimate(&format!("{args} --json"))).unwrap();
+        report["images"][0]["within_95"].as_bool()
+    };
+    let calibrated = ["auto", "elsewhere.txt"].map(|truth| within_95(&format!("--model calibrated.safetensors --truth {truth}")));
+    assert_eq!(calibrated, [Some(true), Some(false)]);
+    assert_eq!(within_95("--model model.safetensors --accept 9 --truth auto"), None);
     let evaluate = "evaluate --model calibrated.safetensors --data one --starts truth.txt --steps 1 --no-cull --executor cpu";
     assert!(run(dir, evaluate, 0).contains("ellipsoid of 1 of 1"));
 }

@@ -15,7 +15,7 @@ use super::mask::MadeRight;
 use super::notation::{Notation, NotationArgs};
 use super::outline;
 use super::record::Log;
-use super::search::{On, PoseError, SearchArgs, Starts, deviation, run as search};
+use super::search::{On, PoseError, SearchArgs, Starts, deviation, run as search, within_95};
 use crate::common::{EngineArgs, Result, create_dir, load_model, print, progress, refuse_existing, refuse_to_write};
 
 /// Pictures that are searched for side by side, enough to fill a large GPU. What was found of them is printed before the next ones are looked at.
@@ -117,6 +117,8 @@ struct ImageReport {
     /// Number of the winning start.
     start: usize,
     error: Option<PoseError>,
+    /// Whether the true pose lies within the stated 95 % ellipsoid.
+    within_95: Option<bool>,
     /// All starts, the winner first.
     ranking: Vec<RankedReport>,
     seconds: f64,
@@ -339,6 +341,7 @@ impl Output<'_> {
             searches: found.searches,
             start: found.estimate.ranking[0].start,
             error: error(&found.world_from_camera),
+            within_95: picture.truth.and_then(|truth| within_95(self.on.model, picture.instance, found, &truth)),
             ranking: found.estimate.ranking.iter().map(ranked).collect(),
             seconds: found.seconds,
         }

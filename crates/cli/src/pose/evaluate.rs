@@ -12,7 +12,7 @@ use srn_data::sheet;
 use super::draw;
 use super::files::{Picture, write_png};
 use super::notation::{Notation, NotationArgs};
-use super::search::{On, PoseError, SearchArgs, Starts};
+use super::search::{On, PoseError, SearchArgs, Starts, within_95};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::tables;
@@ -185,8 +185,6 @@ pub(super) fn view_report(
     let errors = found.estimate.ranking.iter().map(|r| error_of(&r.pose.to_matrix()));
     let truth = &symmetries.nearest(truth, &found.world_from_camera);
     let error = error_of(&found.world_from_camera);
-    let within_95 =
-        model.metadata.calibration.as_ref().and_then(|calibration| found.estimate.states(truth, instance, calibration));
     ViewReport {
         instance: instance.into(),
         view: picture.name.clone(),
@@ -198,7 +196,7 @@ pub(super) fn view_report(
         unexplained: found.unexplained,
         trusted: found.is_trusted(),
         confidence: found.confidence,
-        within_95,
+        within_95: within_95(model, picture.instance, found, truth),
         rival_higher: found.estimate.rival().map(|(_, higher)| higher),
         searches: found.searches,
         seconds: found.seconds,

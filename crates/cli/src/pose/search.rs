@@ -310,6 +310,12 @@ impl PoseError {
     }
 }
 
+/// Whether the true pose lies within the ellipsoid that a calibrated model states for 95 % of all.
+pub fn within_95(model: &Model, instance: u32, found: &Found, truth: &DMat4) -> Option<bool> {
+    let calibration = model.metadata.calibration.as_ref()?;
+    found.estimate.states(truth, &model.instance_name(instance), calibration)
+}
+
 impl std::fmt::Display for PoseError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{:.2}° {:.3}", self.rotation_deg, self.translation)
