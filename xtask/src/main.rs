@@ -49,6 +49,15 @@ const COMMANDS: &[Command] = &[
         run: |arguments| shell::bin("bench", arguments),
     },
     Command {
+        name: "robustness",
+        arguments: "[TABLE…] [--seed N]",
+        about: "search pictures whose light, masks and distances are not as in training",
+        run: |arguments| {
+            shell::run(shell::cargo().args(["build", "--release", "--bin", "sigma-data", "--bin", "sigma-pose"]))?;
+            shell::bin("robustness", arguments)
+        },
+    },
+    Command {
         name: "table",
         arguments: "[--check]",
         about: "print the table of kernels into shaders/README.md, or compare it",
