@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-use glam::DMat4;
+use glam::{DMat4, DQuat, DVec3};
 use serde_json::Value;
 use sigma_srn::camera::pose_error;
 use sigma_srn::{Calibration, Metadata, Model, ModelConfig, Seen};
@@ -629,6 +629,12 @@ fn poses_are_given_and_printed_as_they_came() {
     assert!((rotation - error(other, "rotation_deg")).abs() < 1e-6);
     let diagonal = metres / error(other, "translation");
     assert!((0.3..0.4).contains(&diagonal), "the box is a third of a metre: {diagonal}");
+    let object = |report: &Value| {
+        let numbers = |name: &str| report["camera_from_object"][name].clone();
+        let orientation = DQuat::from_array(serde_json::from_value(numbers("orientation")).unwrap());
+        DMat4::from_rotation_translation(orientation, DVec3::from_array(serde_json::from_value(numbers("position")).unwrap()))
+    };
+    assert!(object(other).abs_diff_eq(in_source.inverse(), 1e-9), "{other}");
 
     // `track` prints all of it in metres.
     let track =
@@ -636,6 +642,7 @@ fn poses_are_given_and_printed_as_they_came() {
     let tracked = json(&run(dir, &format!("{track} --json"), 0));
     let (_, metres) = pose_error(&matrix(&tracked["world_from_camera"]), &source);
     assert!((error(&tracked, "translation") - metres).abs() < 1e-6, "{tracked}");
+    assert!(object(&tracked).abs_diff_eq(matrix(&tracked["world_from_camera"]).inverse(), 1e-9), "{tracked}");
 
     // The line says the same, and a start in a file is read like a rough pose.
     let line = run(dir, &format!("{} --starts source.txt --no-cull {outside}", picture.replace(" --json", "")), 0);

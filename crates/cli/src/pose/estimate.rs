@@ -12,7 +12,7 @@ use srn_data::camera::Axes;
 
 use super::files::{Masks, ObjectArgs, Picture, PoseSource, model_side, srn_instance, warn_of_turned};
 use super::mask::MadeRight;
-use super::notation::{Notation, NotationArgs};
+use super::notation::{Notation, NotationArgs, ObjectPose};
 use super::outline;
 use super::record::Log;
 use super::search::{On, PoseError, SearchArgs, Starts, deviation, run as search, within_95};
@@ -93,6 +93,8 @@ struct ImageReport {
     world_from_camera: [[f64; 4]; 4],
     /// The same in frame and units of the photographs that were imported: by --frame, or the frame.json of the picture's instance.
     source_from_camera: Option<[[f64; 4]; 4]>,
+    /// In frame and units of `source_from_camera` where that is known, else of `world_from_camera`.
+    camera_from_object: ObjectPose,
     /// θ1, θ2, θ3 of `R = Rx(θ1)·Ry(θ2)·Rz(θ3)` of `world_from_camera`.
     euler_rad: [f64; 3],
     /// Its camera centre, object units.
@@ -328,6 +330,10 @@ impl Output<'_> {
             instance,
             world_from_camera: world_from_camera.transpose().to_cols_array_2d(),
             source_from_camera: self.sources[k].map(|source| source.rows(&found.world_from_camera)),
+            camera_from_object: self.sources[k]
+                .as_ref()
+                .unwrap_or(self.notation)
+                .object(&found.world_from_camera, found.confidence),
             euler_rad: [a, b, c],
             translation: [x, y, z],
             loss: found.estimate.loss,

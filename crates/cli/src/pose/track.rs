@@ -10,7 +10,7 @@ use srn_data::pixels::{ENDINGS, is_picture};
 use super::draw;
 use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side, warn_of_turned};
 use super::mask::MadeRight;
-use super::notation::NotationArgs;
+use super::notation::{NotationArgs, ObjectPose};
 use super::search::{PoseError, SearchArgs, Starts, deviation, query, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
 
@@ -65,6 +65,8 @@ struct FrameReport<'a> {
     frame: &'a Path,
     /// Rows of the 4×4 matrix, as the flags for poses want it.
     world_from_camera: [[f64; 4]; 4],
+    /// In the same frame and units.
+    camera_from_object: ObjectPose,
     loss: f64,
     unexplained: f64,
     trusted: bool,
@@ -148,6 +150,7 @@ pub fn run(args: &Track) -> Result<bool> {
         let report = FrameReport {
             frame: &path,
             world_from_camera: written.transpose().to_cols_array_2d(),
+            camera_from_object: notation.object(&found.world_from_camera, found.confidence),
             loss: found.estimate.loss,
             unexplained: found.unexplained,
             trusted,
