@@ -14,11 +14,13 @@ pub struct Outline {
     pub dilation: f64,
     /// What is cut away on one side, a shadow that was taken for the object: where it is (columns, rows), and how wide.
     pub cut: DVec2,
+    /// How wide a cut is that explains a picture better, but not by so much that it is believed: it is not made, and what it would have changed is uncertain.
+    pub undecided: f64,
 }
 
 impl Outline {
     /// As the mask is.
-    pub const AS_GIVEN: Outline = Outline { dilation: 0.0, cut: DVec2::ZERO };
+    pub const AS_GIVEN: Outline = Outline { dilation: 0.0, cut: DVec2::ZERO, undecided: 0.0 };
 
     /// How far it is moved.
     pub(crate) fn length(&self) -> f64 {
@@ -30,7 +32,11 @@ impl Add for Outline {
     type Output = Self;
 
     fn add(self, other: Self) -> Self {
-        Outline { dilation: self.dilation + other.dilation, cut: self.cut + other.cut }
+        Outline {
+            dilation: self.dilation + other.dilation,
+            cut: self.cut + other.cut,
+            undecided: self.undecided + other.undecided,
+        }
     }
 }
 
@@ -39,15 +45,17 @@ impl Mul<f64> for Outline {
 
     /// In pixels that are so many times smaller.
     fn mul(self, times: f64) -> Self {
-        Outline { dilation: times * self.dilation, cut: times * self.cut }
+        Outline { dilation: times * self.dilation, cut: times * self.cut, undecided: times * self.undecided }
     }
 }
 
 /// How far masks are tried dilated, in pixels; the first is as given.
 const DILATIONS: [f64; 5] = [0.0, -1.0, 1.0, -2.0, 2.0];
 
-/// How much is tried to be cut away on a side, in pixels, and on which.
+/// How much is tried to be cut away on a side, in pixels, and on which; and what else where that is worth a closer look.
 const CUT: f64 = 3.0;
+const NARROW: f64 = 1.5;
+pub(crate) const WIDEST_CUT: f64 = 4.5;
 const SIDES: [DVec2; 8] = [
     DVec2::X,
     DVec2::splat(FRAC_1_SQRT_2),
@@ -69,9 +77,9 @@ pub(crate) fn outlines() -> impl Iterator<Item = Outline> {
 /// little more, too; and of exact masks the best are some tenths of a pixel off, by the shape that a network has learnt.
 const BETTER: f64 = 0.15;
 
-/// Which part of the least loss that dilations leave, for each pixel, a cut must leave at most. So 53 of 72 shadows as wide as a cut are cut away, and something
-/// of 2 of 324 masks without one (`docs/accuracy.md`).
-const CUT_LEAVES: f64 = 0.75;
+/// Which part of the least loss that dilations leave, for each pixel, a cut must leave at most to be believed, and to be worth a closer look (`docs/accuracy.md`).
+const CUT_LEAVES: f64 = 0.72;
+const CUT_IS_WORTH: f64 = 1.4;
 
 /// Directions in which a pixel looks around.
 const DIRECTIONS: usize = 16;
@@ -92,7 +100,7 @@ pub(crate) fn with_outline(
     width: usize,
     outline: Outline,
 ) -> (Vec<f32>, Vec<f32>) {
-    let Outline { dilation, cut } = outline;
+    let Outline { dilation, cut, .. } = outline;
     let parts = |length: f64| 1..=length.abs().ceil() as usize;
     // Twice as many as pixels, so that nothing narrow is passed over.
     let along = parts(2.0 * cut.length());
@@ -166,32 +174,58 @@ fn between(rgb: &[f32], coverage: &[f32], weights: Option<&[f32]>, width: usize,
     Some((cover, darker))
 }
 
-/// What leaves the least loss: a cut, if that is much less than what dilations leave, else a dilation. `losses` are in the order of [`outlines`].
-pub(crate) fn best_outline(losses: &[f64]) -> Outline {
+/// How many of [`closer_outlines`] are tried from where the others began; the rest go on from where those ended.
+pub(crate) const NARROW_CUTS: usize = 3;
+
+/// What is worth a closer look: where a cut leaves little more than the least that dilations do, narrower ones on its side and to either side of it; then the
+/// same cut again, a wider one, and the best dilation again beside which those are judged. `losses` are in the order of [`outlines`].
+pub(crate) fn closer_outlines(losses: &[f64]) -> Vec<Outline> {
+    let (dilated, cuts) = losses.split_at(DILATIONS.len());
+    let least = |losses: &[f64]| (0..losses.len()).min_by(|&a, &b| losses[a].total_cmp(&losses[b])).unwrap_or_default();
+    let (side, dilation) = (least(cuts), DILATIONS[least(dilated)]);
+    if cuts[side].is_nan() || cuts[side] >= CUT_IS_WORTH * best_dilation(dilated).1 {
+        return vec![];
+    }
+    let cut = |width: f64, by: usize| Outline { cut: width * SIDES[(side + by) % SIDES.len()], ..Outline::AS_GIVEN };
+    let narrow: [Outline; NARROW_CUTS] = [0, 1, SIDES.len() - 1].map(|by| cut(NARROW, by));
+    narrow.into_iter().chain([cut(CUT, 0), cut(WIDEST_CUT, 0), Outline { dilation, ..Outline::AS_GIVEN }]).collect()
+}
+
+/// What leaves the least loss: a cut, if that is much less than what dilations leave, else a dilation; none, if the mask is not that much worse as given.
+/// `losses` are in the order of [`outlines`], `closer` in that of [`closer_outlines`].
+pub(crate) fn best_outline(losses: &[f64], closer: &[f64]) -> Outline {
     let (dilated, cut) = losses.split_at(DILATIONS.len());
-    let least = dilated.iter().copied().fold(f64::INFINITY, f64::min);
-    match zip(cut, outlines().skip(DILATIONS.len())).min_by(|a, b| a.0.total_cmp(b.0)) {
-        Some((loss, cut)) if *loss < CUT_LEAVES * least => cut,
-        _ => Outline { dilation: best_dilation(dilated), ..Outline::AS_GIVEN },
+    let (dilation, least) = best_dilation(dilated);
+    let is_better = least < (1.0 - BETTER * dilation.abs()) * losses[0];
+    let dilation = Outline { dilation: if is_better { dilation } else { 0.0 }, ..Outline::AS_GIVEN };
+    // More steps leave less: what has gone on is beside what dilations leave then.
+    let again = closer.last().map_or(1.0, |again| again / dilated.iter().copied().fold(f64::INFINITY, f64::min));
+    let tried = zip(outlines().skip(DILATIONS.len()), cut).map(|(cut, loss)| (cut, loss / least));
+    let of_closer = |(number, (cut, loss))| (cut, loss / if number < NARROW_CUTS { least } else { again * least });
+    let cuts =
+        tried.chain(zip(closer_outlines(losses), closer).enumerate().map(of_closer)).filter(|(cut, _)| cut.cut != DVec2::ZERO);
+    match cuts.min_by(|a, b| a.1.total_cmp(&b.1)) {
+        Some((cut, leaves)) if leaves < CUT_LEAVES => cut,
+        Some((cut, leaves)) if leaves < 1.0 => Outline { undecided: cut.cut.length(), ..dilation },
+        _ => dilation,
     }
 }
 
-/// The dilation with the least loss: where a parabola through the losses at the best that was tried and to either side of it ends; none, if the mask is not
-/// that much worse as given. `losses` are in the order of [`DILATIONS`].
-fn best_dilation(losses: &[f64]) -> f64 {
-    let mut tried: Vec<(f64, f64)> = DILATIONS.into_iter().zip(losses.iter().copied()).collect();
+/// The dilation with the least loss, and that: where a parabola through the losses at the best that was tried and to either side of it ends. `losses` are in
+/// the order of [`DILATIONS`].
+fn best_dilation(losses: &[f64]) -> (f64, f64) {
+    let mut tried: Vec<(f64, f64)> = zip(DILATIONS, losses.iter().copied()).collect();
     tried.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let Some(best) = (0..tried.len()).min_by(|&a, &b| tried[a].1.total_cmp(&tried[b].1)) else { return 0.0 };
+    let Some(best) = (0..tried.len()).min_by(|&a, &b| tried[a].1.total_cmp(&tried[b].1)) else { return (0.0, f64::NAN) };
     let ((at, least), beside) =
         (tried[best], best.checked_sub(1).and_then(|before| Some((tried[before].1, tried.get(best + 1)?.1))));
-    let (at, least) = match beside {
+    match beside {
         Some((left, right)) if left + right - 2.0 * least > 0.0 && (left + right).is_finite() => {
             let (slope, curvature) = ((right - left) / 2.0, left + right - 2.0 * least);
             (at - slope / curvature, least - slope * slope / (2.0 * curvature))
         }
         _ => (at, least),
-    };
-    if least < (1.0 - BETTER * at.abs()) * losses[0] { at } else { 0.0 }
+    }
 }
 
 #[cfg(test)]
@@ -268,16 +302,33 @@ mod tests {
         assert_eq!(below.cut, DVec2::new(0.0, 3.0));
         let losses = |dilated: f64, cut: f64| {
             let of = |outline: Outline| match outline {
-                Outline { dilation: -1.0, .. } => dilated,
+                Outline { dilation: -2.0, .. } => dilated,
                 outline if outline == below => cut,
-                _ => 1.0,
+                outline => 1.0 + outline.cut.length(),
             };
-            best_outline(&outlines().map(of).collect::<Vec<_>>())
+            outlines().map(of).collect::<Vec<_>>()
         };
-        let dilated = Outline { dilation: -1.0, ..Outline::AS_GIVEN };
-        assert_eq!([losses(1.0, 0.76), losses(1.0, 0.74)], [Outline::AS_GIVEN, below]);
-        assert_eq!([losses(0.5, 0.38), losses(0.5, 0.37)], [dilated, below]);
-        assert_eq!([f64::INFINITY, f64::NAN].map(|loss| best_outline(&[loss; 13])), [Outline::AS_GIVEN; 2]);
+        let best = |dilated: f64, cut: f64| best_outline(&losses(dilated, cut), &[]);
+        let dilated = Outline { dilation: -2.0, ..Outline::AS_GIVEN };
+        let undecided = |outline: Outline, undecided: f64| Outline { undecided, ..outline };
+        assert_eq!([best(1.0, 1.1), best(1.0, 0.9)], [Outline::AS_GIVEN, undecided(Outline::AS_GIVEN, 3.0)]);
+        assert_eq!([best(1.0, 0.73), best(1.0, 0.71)], [undecided(Outline::AS_GIVEN, 3.0), below]);
+        assert_eq!([best(0.5, 0.37), best(0.5, 0.35)], [undecided(dilated, 3.0), below]);
+        assert_eq!([f64::INFINITY, f64::NAN].map(|loss| best_outline(&[loss; 13], &[])), [Outline::AS_GIVEN; 2]);
+
+        // A closer look finds a narrower one on the same side, or beside it.
+        let closer = closer_outlines(&losses(1.0, 1.3));
+        let [x, y] = [1.5 * FRAC_1_SQRT_2, 1.5];
+        let cuts = [(0.0, y), (-x, x), (x, x), (0.0, 3.0), (0.0, 4.5), (0.0, 0.0)].map(|(x, y)| DVec2::new(x, y));
+        assert!(closer.len() == 6 && zip(&closer, cuts).all(|(outline, cut)| outline.cut.abs_diff_eq(cut, 1e-12)), "{closer:?}");
+        assert_eq!(closer_outlines(&losses(0.5, 0.6))[5], dilated);
+        assert_eq!((closer_outlines(&losses(0.9, 1.3)), closer_outlines(&[f64::NAN; 13])), (vec![], vec![]));
+        let best = |closer: [f64; 6]| best_outline(&losses(1.0, 1.3), &closer);
+        assert_eq!(best([1.0, 0.7, 0.8, 1.0, 1.0, 1.0]), closer[1]);
+        assert_eq!(best([1.0, 0.8, 1.2, 1.0, 1.0, 1.0]), undecided(Outline::AS_GIVEN, closer[1].cut.length()));
+        // What dilations leave after more steps, too, is what wide cuts are measured by.
+        assert_eq!(best([1.0, 1.0, 1.0, 1.0, 0.65, 1.0]), closer[4]);
+        assert_eq!(best([1.0, 1.0, 1.0, 1.0, 0.65, 0.8]), undecided(Outline::AS_GIVEN, 4.5));
     }
 
     #[test]
@@ -310,15 +361,17 @@ mod tests {
     #[test]
     fn the_best_dilation_lies_between_those_tried() {
         let losses = |least: f64, depth: f64| DILATIONS.map(|by| 1.0 + depth * (by - least) * (by - least));
+        // With cuts that are worth nothing.
+        let best = |dilated: [f64; 5]| best_outline(&[&dilated[..], &[f64::INFINITY; 8]].concat(), &[]).dilation;
         for least in [-1.4, -0.7, 0.8, 1.3] {
-            assert!((best_dilation(&losses(least, 0.5)) - least).abs() < 1e-9, "{least}");
+            assert!((best(losses(least, 0.5)) - least).abs() < 1e-9, "{least}");
         }
         // Beyond them there is nothing to go by.
-        assert_eq!([-3.0, 2.6].map(|least| best_dilation(&losses(least, 0.5))), [-2.0, 2.0]);
+        assert_eq!([-3.0, 2.6].map(|least| best(losses(least, 0.5))), [-2.0, 2.0]);
         // Nearly exact masks stay as they are, and those of searches that went wrong.
-        assert_eq!([best_dilation(&losses(0.2, 0.5)), best_dilation(&losses(1.3, 0.1))], [0.0; 2]);
-        assert_eq!(best_dilation(&[f64::INFINITY; 5]), 0.0);
-        assert_eq!(best_dilation(&[1.0, 0.5, f64::INFINITY, f64::INFINITY, 2.0]), -1.0);
-        assert_eq!(best_dilation(&[f64::NAN, 0.5, 1.0, 1.0, 2.0]), 0.0);
+        assert_eq!([best(losses(0.2, 0.5)), best(losses(1.3, 0.1))], [0.0; 2]);
+        assert_eq!(best([f64::INFINITY; 5]), 0.0);
+        assert_eq!(best([1.0, 0.5, f64::INFINITY, f64::INFINITY, 2.0]), -1.0);
+        assert_eq!(best([f64::NAN, 0.5, 1.0, 1.0, 2.0]), 0.0);
     }
 }

@@ -4,13 +4,13 @@ use glam::DMat4;
 
 use crate::confidence::Doubt;
 use crate::estimator::{Options, Phase, Progress, Query};
-use crate::mask::Outline;
+use crate::mask::{Outline, WIDEST_CUT};
 use crate::search::{Found, Search};
 use crate::{Engine, Error, Model};
 
-/// Pixels that a mask may be off, as the model sees it: as far as a search tries. An object that comes from near to far has fewer pixels to lose.
+/// Pixels that a mask may be too large or too small, as the model sees it: as far as a search tries, as with [`WIDEST_CUT`]. An object that comes from near to
+/// far has fewer pixels to lose.
 const WIDEST_RIM: f64 = 2.0;
-const WIDEST_CUT: f64 = 3.0;
 
 /// Follows an object through the frames of a video. A frame that the last pose does not lead to is searched all around.
 #[derive(Clone, Debug)]
@@ -54,8 +54,9 @@ impl Tracker {
         }
         let (engine, model) = (&self.engine, &self.model);
         let focal = frame.intrinsics.fx;
-        let Outline { dilation, cut } = self.rim.unwrap_or_default() * focal;
-        let outline = Outline { dilation: dilation.clamp(-WIDEST_RIM, WIDEST_RIM), cut: cut.clamp_length_max(WIDEST_CUT) };
+        let rim = self.rim.unwrap_or_default() * focal;
+        let (dilation, cut) = (rim.dilation.clamp(-WIDEST_RIM, WIDEST_RIM), rim.cut.clamp_length_max(WIDEST_CUT));
+        let outline = Outline { dilation, cut, ..rim };
         let frame = Query { instance: self.number, outline, ..frame };
         let near = match self.before[..] {
             [] => None,

@@ -81,7 +81,7 @@ struct Table {
 const TABLES: [Table; 6] = [
     Table {
         name: "distance",
-        searches: &[AROUND, AROUND_FAST],
+        searches: &[AROUND_FAST],
         rows: &[from("1.3", 1.3, FOCAL), from("2", 2.0, FOCAL), from("3", 3.0, FOCAL), from("5", 5.0, FOCAL)],
     },
     Table {
@@ -89,7 +89,7 @@ const TABLES: [Table; 6] = [
     },
     Table {
         name: "light",
-        searches: &[AROUND],
+        searches: &[AROUND_FAST],
         rows: &[
             row("the model's", Spoil::Nothing),
             row("1 stop less", Spoil::Light(|colour, _| exposed(colour, [0.5; 3]))),
@@ -121,7 +121,7 @@ const TABLES: [Table; 6] = [
     },
     Table {
         name: "hidden",
-        searches: &[AROUND, AROUND_FAST, NEAR_FAST],
+        searches: &[AROUND, AROUND_FAST],
         rows: &[
             row("object alone", Spoil::Alone),
             row("3/10 hidden", Spoil::Bar(0.3)),

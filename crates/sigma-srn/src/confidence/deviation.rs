@@ -95,6 +95,11 @@ impl Estimate {
         let mut covariance = mixed.map(|row| row.map(|entry| CUT_OUT * size * entry));
         let radius = 0.5 * self.extent * f64::from(self.width);
         covariance[5][5] += (self.pose.distance() * OUTLINE.hypot(OF_MOVED * outline.length()) / radius).powi(2);
+        // Were as much on one side no part of the object, its middle would be half as far to the other, it as much smaller, and turned as such a shift looks.
+        let part = 0.5 * outline.undecided / radius;
+        for (k, size) in [1.0, 1.0, 1.0, 0.5, 0.5, self.pose.distance()].into_iter().enumerate() {
+            covariance[k][k] += (size * part).powi(2);
+        }
         Some(covariance)
     }
 
@@ -285,6 +290,11 @@ mod tests {
             let outline = Outline { dilation, ..Outline::AS_GIVEN };
             assert_eq!(variances(Some(outline)), [2e8, 2e8, (2e8 + 1e12 * along * along).round()], "{dilation}");
         }
+        // A sixteenth, by which half of what may have to be cut away changes what is seen.
+        let [turn, aside, along] = variances(Some(Outline { undecided: 2.0, ..Outline::AS_GIVEN }));
+        let part: f64 = 1e12 / 256.0;
+        assert_eq!([turn, aside], [2e8 + part, 2e8 + 0.25 * part]);
+        assert!((along - variances(Some(Outline::AS_GIVEN))[2] - 1.69 * part).abs() < 2.0, "{along}");
     }
 
     #[test]

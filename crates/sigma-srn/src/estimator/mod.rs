@@ -22,7 +22,7 @@ use crate::confidence::{motion, promise};
 use crate::descent::{Descent, Method};
 use crate::engine::{Engine, proof};
 use crate::light::Light;
-use crate::mask::{Outline, best_outline, outlines};
+use crate::mask::{NARROW_CUTS, Outline, best_outline, closer_outlines, outlines};
 use crate::model::Model;
 use crate::random::{initial_depths, stream};
 
@@ -231,9 +231,15 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         if running.is_empty() {
             return Ok(rest);
         }
+        let entered = running.clone();
         self.follow(phase, Some(number) == self.last, &mut running)?;
         if phase.outlines {
-            running = self.with_best_outlines(&running);
+            let mut closer = self.with_closer_outlines(&running, &entered);
+            if !closer.is_empty() {
+                self.steps += phase.steps;
+                self.follow(phase, false, &mut closer)?;
+            }
+            running = self.with_best_outlines(&running, &closer);
         }
         running.iter_mut().for_each(|h| h.phases = number + 1);
         running.extend(rest);
@@ -271,21 +277,50 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         self.outlines[query].unwrap_or_default()
     }
 
-    /// Finds the outline of each query that leaves the least loss, and of each start the hypothesis whose own is nearest to it.
-    fn with_best_outlines(&mut self, tried: &[Hypothesis]) -> Vec<Hypothesis> {
-        // Those of one start come one after the other.
-        let of_starts = || tried.chunks(outlines().count());
+    /// Of each query the best start's hypotheses, one for each of [`outlines`], and their losses per covered pixel.
+    fn best_outlined<'h>(&self, tried: &'h [Hypothesis]) -> Vec<(&'h [Hypothesis], Vec<f64>)> {
         let least = |tried: &&[Hypothesis]| tried.iter().map(|h| h.loss).fold(f64::INFINITY, f64::min);
-        for number in 0..self.queries.len() {
-            let own = of_starts().filter(|tried| tried[0].query == number);
-            let Some(best) = own.min_by(|a, b| least(a).total_cmp(&least(b))) else { continue };
-            let per_area = |h: &Hypothesis| h.loss / self.queries[number].area(h.outline);
-            let losses: Vec<f64> = best.iter().map(per_area).collect();
-            self.outlines[number] = Some(best[0].outline + best_outline(&losses));
+        let of_query = |number| {
+            // Those of one start come one after the other.
+            let own = tried.chunks(outlines().count()).filter(move |tried| tried[0].query == number);
+            own.min_by(|a, b| least(a).total_cmp(&least(b)))
+        };
+        let best = (0..self.queries.len()).filter_map(of_query);
+        best.map(|tried| (tried, tried.iter().map(|h| self.per_area(h)).collect())).collect()
+    }
+
+    fn per_area(&self, h: &Hypothesis) -> f64 {
+        h.loss / self.queries[h.query].area(h.outline)
+    }
+
+    /// The best start of each query with the outlines that are worth a closer look, as it has `entered`, or where the nearest outline has led it.
+    fn with_closer_outlines(&self, tried: &[Hypothesis], entered: &[Hypothesis]) -> Vec<Hypothesis> {
+        let of_query = |(tried, losses): (&[Hypothesis], Vec<f64>)| {
+            let first = *entered.iter().find(|h| (h.query, h.start) == (tried[0].query, tried[0].start)).expect("it has entered");
+            let new = |(number, by)| {
+                let outline = first.outline + by;
+                let led = if number < NARROW_CUTS { None } else { nearest(tried, outline).copied() };
+                Hypothesis { outline, ..led.unwrap_or(first) }
+            };
+            closer_outlines(&losses).into_iter().enumerate().map(new).collect::<Vec<_>>()
+        };
+        self.best_outlined(tried).into_iter().flat_map(of_query).collect()
+    }
+
+    /// Finds the outline of each query that leaves the least loss, and of each start the hypothesis whose own is nearest to it.
+    fn with_best_outlines(&mut self, tried: &[Hypothesis], closer: &[Hypothesis]) -> Vec<Hypothesis> {
+        for (tried, losses) in self.best_outlined(tried) {
+            let (query, as_given) = (tried[0].query, tried[0].outline);
+            let closer: Vec<f64> = closer.iter().filter(|h| h.query == query).map(|h| self.per_area(h)).collect();
+            let by = best_outline(&losses, &closer);
+            self.outlines[query] = Some(Outline { undecided: by.undecided, ..as_given + by });
         }
-        let apart = |h: &&Hypothesis| (h.outline + self.outline(h.query) * -1.0).length();
-        let nearest = |tried: &[Hypothesis]| tried.iter().min_by(|a, b| apart(a).total_cmp(&apart(b))).copied();
-        of_starts().filter_map(nearest).collect()
+        let of_start = |tried: &[Hypothesis]| {
+            let first = tried[0];
+            let closer = closer.iter().filter(|h| (h.query, h.start) == (first.query, first.start));
+            nearest(tried.iter().chain(closer), self.outline(first.query)).copied()
+        };
+        tried.chunks(outlines().count()).filter_map(of_start).collect()
     }
 
     /// The last phase once more, for those that have not arrived.
@@ -392,6 +427,12 @@ fn split_off_met(own: &mut Vec<Hypothesis>) -> Vec<Hypothesis> {
         if own.iter().any(is_here) { &mut met } else { &mut *own }.push(hypothesis);
     }
     met
+}
+
+/// Of some hypotheses the one whose outline is the nearest to this.
+fn nearest<'h>(tried: impl IntoIterator<Item = &'h Hypothesis>, outline: Outline) -> Option<&'h Hypothesis> {
+    let apart = |h: &&Hypothesis| (h.outline + outline * -1.0).length();
+    tried.into_iter().min_by(|a, b| apart(a).total_cmp(&apart(b)))
 }
 
 /// Takes the best that shows another side than the first of a query's hypotheses, the best first, out of those, if it would not be among the

@@ -128,8 +128,8 @@ impl Query {
             return Err(format!("needs a coverage of {pixels} values from 0 to 1"));
         }
         let side = f64::from(width.max(height));
-        let Outline { dilation, cut } = self.outline;
-        if let Some(by) = [dilation, cut.x, cut.y].into_iter().find(|by| by.is_nan() || by.abs() > side) {
+        let Outline { dilation, cut, undecided } = self.outline;
+        if let Some(by) = [dilation, cut.x, cut.y, undecided].into_iter().find(|by| by.is_nan() || by.abs() > side) {
             return Err(format!("a mask whose outline is {by} pixels off, where the image has {side}"));
         }
         if let Some(weights) = &self.weights {
