@@ -327,8 +327,8 @@ mod tests {
         assert_eq!(best([1.0, 0.7, 0.8, 1.0, 1.0, 1.0]), closer[1]);
         assert_eq!(best([1.0, 0.8, 1.2, 1.0, 1.0, 1.0]), undecided(Outline::AS_GIVEN, closer[1].cut.length()));
         // What dilations leave after more steps, too, is what wide cuts are measured by.
-        assert_eq!(best([1.0, 1.0, 1.0, 1.0, 0.65, 1.0]), closer[4]);
-        assert_eq!(best([1.0, 1.0, 1.0, 1.0, 0.65, 0.8]), undecided(Outline::AS_GIVEN, 4.5));
+        assert_eq!(best([1.0, 1.0, 1.0, 1.0, 0.7, 1.0]), closer[4]);
+        assert_eq!(best([1.0, 1.0, 1.0, 1.0, 0.7, 0.9]), undecided(Outline::AS_GIVEN, 4.5));
     }
 
     #[test]
