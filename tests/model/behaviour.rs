@@ -413,8 +413,10 @@ fn masks_are_tried_dilated() {
             [[3, 3]; 2]
         );
         let without = [(0, 1, 6), (0, 1, 6), (1, 1, 6)];
-        let with = [(0, 3, 6), (0, 3, 13), (1, 3, 13), (2, 3, 13), (2, 3, 6), (3, 3, 6)];
-        assert_eq!(steps, [without.as_slice(), &with].concat());
+        // Nearly a shadow: a closer look takes two steps more.
+        let closer = [(2, 5, 6), (3, 5, 6), (4, 5, 6)];
+        let with = [[(0, 3, 6), (0, 3, 13), (1, 3, 13), (2, 3, 13)].as_slice(), &closer, &[(4, 5, 6), (5, 5, 6)]].concat();
+        assert_eq!(steps, [&without[..], &with].concat());
 
         // What is known of the outline already, as from another frame, holds from the beginning; where dilations are tried, they are beside it.
         let given = |dilation: f64| {

@@ -222,7 +222,8 @@ fn best_dilation(losses: &[f64]) -> (f64, f64) {
     match beside {
         Some((left, right)) if left + right - 2.0 * least > 0.0 && (left + right).is_finite() => {
             let (slope, curvature) = ((right - left) / 2.0, left + right - 2.0 * least);
-            (at - slope / curvature, least - slope * slope / (2.0 * curvature))
+            // Where losses rise like a V the parabola ends below nothing.
+            (at - slope / curvature, (least - slope * slope / (2.0 * curvature)).max(0.0))
         }
         _ => (at, least),
     }
@@ -371,6 +372,9 @@ mod tests {
         // Nearly exact masks stay as they are, and those of searches that went wrong.
         assert_eq!([best(losses(0.2, 0.5)), best(losses(1.3, 0.1))], [0.0; 2]);
         assert_eq!(best([f64::INFINITY; 5]), 0.0);
+        // An exact mask, beside which no other leaves anything like as little.
+        let exact = [[1e-3, 1.0, 0.6, 2.0, 1.5].as_slice(), &[0.9; 8]].concat();
+        assert_eq!((best_outline(&exact, &[]).cut, closer_outlines(&exact)), (DVec2::ZERO, vec![]));
         assert_eq!(best([1.0, 0.5, f64::INFINITY, f64::INFINITY, 2.0]), -1.0);
         assert_eq!(best([f64::NAN, 0.5, 1.0, 1.0, 2.0]), 0.0);
     }
