@@ -1,5 +1,5 @@
 // y = relu(gamma (x - mean) rstd + beta), rstd = 1 / √(var + 1e-5), var the mean of (x - mean)² over the features; of centred x mean = 0.
-// One invocation holds eight vectors of one or more rows in registers, so that they are read once; eight lanes add up what belongs to one. 32 rows in turn.
+// One invocation holds eight vectors of one or more rows in registers, so that they are read once; eight lanes add up what belongs to one, and take as many turns as there are rows for each such team.
 // x [rows, features], affine [2, features] = (gamma, beta) → y [rows, features], stats [rows, 2] = (mean, rstd); features a multiple of 4, at most 256.
 // OVERWRITES y and stats.
 
@@ -69,11 +69,13 @@ fn main(
     @builtin(subgroup_size) subgroup_size: u32,
     @builtin(subgroup_invocation_id) lane: u32,
 ) {
-    // Eight lanes of a subgroup do 32 rows, whatever its size: 1, 2, 4 or 8 vectors of each make a row.
+    // Eight lanes of a subgroup are a team, whatever its size: 1, 2, 4 or 8 vectors of each make a row.
     let n = params.features / 4u;
     let per_row = select(select(select(1u, 2u, n > 8u), 4u, n > 16u), 8u, n > 32u);
     let team = (subgroup * subgroup_size + lane) / 8u;
-    let first = 32u * (4u * (workgroup.y * workgroups.x + workgroup.x) + team);
+    let turn = 8u / per_row;
+    let first = turn * (4u * (workgroup.y * workgroups.x + workgroup.x) + team);
+    let all_teams = 4u * workgroups.x * workgroups.y;
     // Columns of the vectors; the last one stands in for those beyond the row, which count as zero and are not stored.
     let c0 = lane % 8u;
     let c1 = lane % 8u + 8u * (1u % per_row);
@@ -108,7 +110,7 @@ fn main(
     let beta6 = affine[n + j6];
     let beta7 = affine[n + j7];
     let last = params.rows - 1u;
-    for (var row = first; row < min(first + 32u, params.rows); row += 8u / per_row) {
+    for (var row = first; row < params.rows; row += turn * all_teams) {
         let r0 = row;
         let r1 = row + 1u / per_row;
         let r2 = row + 2u / per_row;

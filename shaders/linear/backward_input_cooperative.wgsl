@@ -23,13 +23,14 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> d_x: array<vec4<f32>>;
 
-// Rows of d_y, 32 features of each, and 32 rows of W, 64 features of each; eight more, so that successive rows begin in different banks.
-const Y_STRIDE: u32 = 40u;
-const W_STRIDE: u32 = 72u;
-var<workgroup> y_high: array<f16, 2560>;
-var<workgroup> y_low: array<f16, 2560>;
-var<workgroup> w_high: array<f16, 2304>;
-var<workgroup> w_low: array<f16, 2304>;
+// Rows of d_y, 32 features of each, and 32 rows of W, 64 features of each, in vectors of four; two vectors more, so that successive rows begin in
+// different banks.
+const Y_STRIDE: u32 = 10u;
+const W_STRIDE: u32 = 18u;
+var<workgroup> y_high: array<vec4<f16>, 640>;
+var<workgroup> y_low: array<vec4<f16>, 640>;
+var<workgroup> w_high: array<vec4<f16>, 576>;
+var<workgroup> w_low: array<vec4<f16>, 576>;
 // The largest value of each row of d_y, as the bits of a float, whose order is that of integers.
 var<workgroup> largest: array<atomic<u32>, 64>;
 // A matrix of sums for each subgroup.
@@ -37,6 +38,9 @@ var<workgroup> sums: array<f32, 1024>;
 
 // Each subgroup has 2 × 2 matrices of the 64 × 64 results.
 const INVOCATIONS: u32 = 1024u / (SIDE * SIDE) * LANES;
+
+// How many invocations look for the largest value of a row.
+const SHARES: u32 = max(INVOCATIONS / 64u, 1u);
 
 // Where the weights of a group begin, in elements.
 fn weights_of(group: u32) -> u32 {
@@ -55,8 +59,8 @@ fn exponent(row: u32) -> u32 {
 }
 
 // The first 11 digits: what f16 holds. By bits, since a driver may take there and back again for the number itself.
-fn high(value: f32) -> f32 {
-    return bitcast<f32>(bitcast<u32>(value) & 0xffffe000u);
+fn high(values: vec4<f32>) -> vec4<f32> {
+    return bitcast<vec4<f32>>(bitcast<vec4<u32>>(values) & vec4(0xffffe000u));
 }
 
 fn put(group: u32, row: u32, in_: u32, sum: vec4<f32>) {
@@ -84,7 +88,6 @@ fn main(
     let n = params.out_features / 4u;
     let begin = params.first_out / 4u;
     let end = params.end_out / 4u;
-    let width = max(end - begin, 1u);
     // The last row and the last feature stand in for those beyond them.
     let y_first = group * params.rows_per_group * n;
     let last_row = params.rows_per_group - 1u;
@@ -99,9 +102,18 @@ fn main(
         sums[i] = 0.0;
     }
     workgroupBarrier();
-    for (var i = index; i < 64u * (end - begin); i += INVOCATIONS) {
-        let v = abs(d_y[y_first + min(first_row + i / width, last_row) * n + begin + i % width]);
-        atomicMax(&largest[i / width], bitcast<u32>(max(max(v.x, v.y), max(v.z, v.w))));
+    for (var r = index / SHARES; r < 64u; r += INVOCATIONS / SHARES) {
+        let at = y_first + min(first_row + r, last_row) * n;
+        var most = vec4(0.0);
+        // Eight at once, which a GPU waits for together.
+        for (var i = begin + index % SHARES; i < end; i += 8u * SHARES) {
+            let a = max(abs(d_y[at + min(i + 0u * SHARES, end - 1u)]), abs(d_y[at + min(i + 1u * SHARES, end - 1u)]));
+            let b = max(abs(d_y[at + min(i + 2u * SHARES, end - 1u)]), abs(d_y[at + min(i + 3u * SHARES, end - 1u)]));
+            let c = max(abs(d_y[at + min(i + 4u * SHARES, end - 1u)]), abs(d_y[at + min(i + 5u * SHARES, end - 1u)]));
+            let d = max(abs(d_y[at + min(i + 6u * SHARES, end - 1u)]), abs(d_y[at + min(i + 7u * SHARES, end - 1u)]));
+            most = max(most, max(max(a, b), max(c, d)));
+        }
+        atomicMax(&largest[r], bitcast<u32>(max(max(most.x, most.y), max(most.z, most.w))));
     }
     workgroupBarrier();
 
@@ -120,26 +132,24 @@ fn main(
             // Nothing beyond the last feature.
             let scale = select(0.0, bitcast<f32>(exponent(r) << 23u), o < end);
             let ys = scale * d_y[y_first + min(first_row + r, last_row) * n + min(o, end - 1u)];
-            let to = Y_STRIDE * r + 4u * (i % 8u);
+            let to = Y_STRIDE * r + i % 8u;
             let ws = W_SCALE * weights[w_first + min(4u * first + i / 16u, 4u * end - 1u) * stride + min(i % 16u, last_in)];
-            let w_to = W_STRIDE * (i / 16u) + 4u * (i % 16u);
-            for (var j = 0u; j < 4u; j++) {
-                y_high[to + j] = f16(high(ys[j]));
-                y_low[to + j] = f16(ys[j] - high(ys[j]));
-                w_high[w_to + j] = f16(high(ws[j]));
-                w_low[w_to + j] = f16(ws[j] - high(ws[j]));
-            }
+            let w_to = W_STRIDE * (i / 16u) + i % 16u;
+            y_high[to] = vec4<f16>(high(ys));
+            y_low[to] = vec4<f16>(ys - high(ys));
+            w_high[w_to] = vec4<f16>(high(ws));
+            w_low[w_to] = vec4<f16>(ws - high(ws));
         }
         workgroupBarrier();
         for (var k = 0u; k < 32u; k += SIDE) {
-            let ya = coopLoadT<Left>(&y_high[Y_STRIDE * row + k], Y_STRIDE);
-            let yb = coopLoadT<Left>(&y_high[Y_STRIDE * (row + SIDE) + k], Y_STRIDE);
-            let wa = coopLoadT<Right>(&w_high[W_STRIDE * k + in_], W_STRIDE);
-            let wb = coopLoadT<Right>(&w_high[W_STRIDE * k + in_ + SIDE], W_STRIDE);
-            let ya_low = coopLoadT<Left>(&y_low[Y_STRIDE * row + k], Y_STRIDE);
-            let yb_low = coopLoadT<Left>(&y_low[Y_STRIDE * (row + SIDE) + k], Y_STRIDE);
-            let wa_low = coopLoadT<Right>(&w_low[W_STRIDE * k + in_], W_STRIDE);
-            let wb_low = coopLoadT<Right>(&w_low[W_STRIDE * k + in_ + SIDE], W_STRIDE);
+            let ya = coopLoadT<Left>(&y_high[Y_STRIDE * row + k / 4u], Y_STRIDE);
+            let yb = coopLoadT<Left>(&y_high[Y_STRIDE * (row + SIDE) + k / 4u], Y_STRIDE);
+            let wa = coopLoadT<Right>(&w_high[W_STRIDE * k + in_ / 4u], W_STRIDE);
+            let wb = coopLoadT<Right>(&w_high[W_STRIDE * k + (in_ + SIDE) / 4u], W_STRIDE);
+            let ya_low = coopLoadT<Left>(&y_low[Y_STRIDE * row + k / 4u], Y_STRIDE);
+            let yb_low = coopLoadT<Left>(&y_low[Y_STRIDE * (row + SIDE) + k / 4u], Y_STRIDE);
+            let wa_low = coopLoadT<Right>(&w_low[W_STRIDE * k + in_ / 4u], W_STRIDE);
+            let wb_low = coopLoadT<Right>(&w_low[W_STRIDE * k + (in_ + SIDE) / 4u], W_STRIDE);
             x_aa = coopMultiplyAdd(ya, wa, coopMultiplyAdd(ya, wa_low, coopMultiplyAdd(ya_low, wa, x_aa)));
             x_ab = coopMultiplyAdd(ya, wb, coopMultiplyAdd(ya, wb_low, coopMultiplyAdd(ya_low, wb, x_ab)));
             x_ba = coopMultiplyAdd(yb, wa, coopMultiplyAdd(yb, wa_low, coopMultiplyAdd(yb_low, wa, x_ba)));

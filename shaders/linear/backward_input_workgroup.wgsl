@@ -23,10 +23,10 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> d_x: array<vec4<f32>>;
 
-// Sixteen output features of a tile, each of 64 rows and of 64 input features, in vectors of four; a row is one longer than it need be, so
-// that successive rows begin in different banks.
-var<workgroup> y_tile: array<vec4<f32>, 272>;
-var<workgroup> w_tile: array<vec4<f32>, 272>;
+// Sixteen output features of a tile, each of 64 rows and of 64 input features, in vectors of four. Where the vector of four rows stands among the
+// sixteen of its feature is crossed with the feature's number, so that eight successive invocations write to different banks.
+var<workgroup> y_tile: array<vec4<f32>, 256>;
+var<workgroup> w_tile: array<vec4<f32>, 256>;
 
 // Where the weights of a group begin, in elements.
 fn weights_of(group: u32) -> u32 {
@@ -41,22 +41,45 @@ fn outer(row: vec4<f32>, column: vec4<f32>) -> mat4x4<f32> {
     return mat4x4(column * row.x, column * row.y, column * row.z, column * row.w);
 }
 
-// Columns are rows of d_x.
-fn store(group: u32, row: u32, in_: u32, tile: mat4x4<f32>) {
+// What an invocation computes: rows 4 ly and 32 + 4 ly, a and b, input features 4 lx and 32 + 4 lx.
+struct Sums {
+    aa: mat4x4<f32>,
+    ab: mat4x4<f32>,
+    ba: mat4x4<f32>,
+    bb: mat4x4<f32>,
+}
+
+// Adds the products of feature k of the sixteen.
+fn multiply_add(sums: ptr<function, Sums>, local: vec3<u32>, k: u32) {
+    let crossed = 2u * (k / 4u);
+    let ya = y_tile[16u * k + (local.y ^ crossed)];
+    let yb = y_tile[16u * k + ((local.y + 8u) ^ crossed)];
+    let wa = w_tile[16u * k + local.x];
+    let wb = w_tile[16u * k + local.x + 8u];
+    (*sums).aa += outer(ya, wa);
+    (*sums).ab += outer(ya, wb);
+    (*sums).ba += outer(yb, wa);
+    (*sums).bb += outer(yb, wb);
+}
+
+fn put(group: u32, row: u32, in_: u32, sum: vec4<f32>) {
     if (row >= params.rows_per_group || in_ >= params.in_features) {
         return;
     }
-    let stride = params.in_features / 4u;
-    let at = (group * params.rows_per_group + row) * stride + in_ / 4u;
-    let count = min(params.rows_per_group - min(row, params.rows_per_group), 4u);
-    var columns = tile;
-    for (var r = 0u; r < count; r++) {
-        var value = columns[r];
-        if (params.accumulate == 1u) {
-            value += d_x[at + r * stride];
-        }
-        d_x[at + r * stride] = value;
+    let at = ((group * params.rows_per_group + row) * params.in_features + in_) / 4u;
+    var value = sum;
+    if (params.accumulate == 1u) {
+        value += d_x[at];
     }
+    d_x[at] = value;
+}
+
+// Columns are rows of d_x.
+fn store(group: u32, row: u32, in_: u32, tile: mat4x4<f32>) {
+    put(group, row, in_, tile[0]);
+    put(group, row + 1u, in_, tile[1]);
+    put(group, row + 2u, in_, tile[2]);
+    put(group, row + 3u, in_, tile[3]);
 }
 
 @compute @workgroup_size(8, 8)
@@ -73,45 +96,50 @@ fn main(
     let n = params.out_features / 4u;
     let stride = params.in_features / 4u;
     let y_row = group * params.rows_per_group + min(first_row + 4u * (index / 4u) + vec4(0u, 1u, 2u, 3u), vec4(params.rows_per_group - 1u));
-    let y_to = 17u * 4u * (index % 4u) + index / 4u;
+    let y_to = 64u * (index % 4u) + ((index / 4u) ^ (2u * (index % 4u)));
     let w_column = weights_of(group) / 4u + min(first_in / 4u + index % 16u, stride - 1u);
-    let w_to = 17u * 4u * (index / 16u) + index % 16u;
+    let w_to = 64u * (index / 16u) + index % 16u;
 
-    var x_aa: mat4x4<f32>;
-    var x_ab: mat4x4<f32>;
-    var x_ba: mat4x4<f32>;
-    var x_bb: mat4x4<f32>;
+    var sums: Sums;
     let end = params.end_out / 4u;
     for (var first = params.first_out / 4u; first < end; first += 4u) {
+        // Nothing beyond the last feature.
+        let within = select(0.0, 1.0, first + index % 4u < end);
         let y_at = y_row * n + min(first + index % 4u, end - 1u);
         let w_at = w_column + 4u * min(first + index / 16u, end - 1u) * stride;
-        let ys = transpose(mat4x4(d_y[y_at.x], d_y[y_at.y], d_y[y_at.z], d_y[y_at.w]));
+        let ys = transpose(mat4x4(d_y[y_at.x], d_y[y_at.y], d_y[y_at.z], d_y[y_at.w])) * within;
         let ws = mat4x4(weights[w_at], weights[w_at + stride], weights[w_at + 2u * stride], weights[w_at + 3u * stride]);
         workgroupBarrier();
         y_tile[y_to] = ys[0];
-        y_tile[y_to + 17u] = ys[1];
-        y_tile[y_to + 34u] = ys[2];
-        y_tile[y_to + 51u] = ys[3];
+        y_tile[y_to + 16u] = ys[1];
+        y_tile[y_to + 32u] = ys[2];
+        y_tile[y_to + 48u] = ys[3];
         w_tile[w_to] = ws[0];
-        w_tile[w_to + 17u] = ws[1];
-        w_tile[w_to + 34u] = ws[2];
-        w_tile[w_to + 51u] = ws[3];
+        w_tile[w_to + 16u] = ws[1];
+        w_tile[w_to + 32u] = ws[2];
+        w_tile[w_to + 48u] = ws[3];
         workgroupBarrier();
-        for (var k = 0u; k < 4u * min(end - first, 4u); k++) {
-            let ya = y_tile[17u * k + 2u * local.y];
-            let yb = y_tile[17u * k + 2u * local.y + 1u];
-            let wa = w_tile[17u * k + 2u * local.x];
-            let wb = w_tile[17u * k + 2u * local.x + 1u];
-            x_aa += outer(ya, wa);
-            x_ab += outer(ya, wb);
-            x_ba += outer(yb, wa);
-            x_bb += outer(yb, wb);
-        }
+        multiply_add(&sums, local, 0u);
+        multiply_add(&sums, local, 1u);
+        multiply_add(&sums, local, 2u);
+        multiply_add(&sums, local, 3u);
+        multiply_add(&sums, local, 4u);
+        multiply_add(&sums, local, 5u);
+        multiply_add(&sums, local, 6u);
+        multiply_add(&sums, local, 7u);
+        multiply_add(&sums, local, 8u);
+        multiply_add(&sums, local, 9u);
+        multiply_add(&sums, local, 10u);
+        multiply_add(&sums, local, 11u);
+        multiply_add(&sums, local, 12u);
+        multiply_add(&sums, local, 13u);
+        multiply_add(&sums, local, 14u);
+        multiply_add(&sums, local, 15u);
     }
-    let row = first_row + 8u * local.y;
-    let in_ = first_in + 8u * local.x;
-    store(group, row, in_, x_aa);
-    store(group, row, in_ + 4u, x_ab);
-    store(group, row + 4u, in_, x_ba);
-    store(group, row + 4u, in_ + 4u, x_bb);
+    let row = first_row + 4u * local.y;
+    let in_ = first_in + 4u * local.x;
+    store(group, row, in_, sums.aa);
+    store(group, row, in_ + 32u, sums.ab);
+    store(group, row + 32u, in_, sums.ba);
+    store(group, row + 32u, in_ + 32u, sums.bb);
 }

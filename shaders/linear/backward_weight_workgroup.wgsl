@@ -22,14 +22,37 @@ struct Params {
 @group(0) @binding(2) var<storage, read> d_y: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> partial: array<vec4<f32>>;
 
-// Sixteen rows of a tile, each of 64 output features and of 64 input features, in vectors of four; a row is one longer than it need be, so
-// that successive rows begin in different banks.
-var<workgroup> y_tile: array<vec4<f32>, 272>;
-var<workgroup> x_tile: array<vec4<f32>, 272>;
+// Sixteen rows of a tile, each of 64 output features and of 64 input features, in vectors of four.
+var<workgroup> y_tile: array<vec4<f32>, 256>;
+var<workgroup> x_tile: array<vec4<f32>, 256>;
 
 // Columns are rows of the weight.
 fn outer(row: vec4<f32>, column: vec4<f32>) -> mat4x4<f32> {
     return mat4x4(column * row.x, column * row.y, column * row.z, column * row.w);
+}
+
+// What an invocation computes: output features 4 ly and 32 + 4 ly, a and b, input features 4 lx and 32 + 4 lx, and the sums over rows of d_y.
+struct Sums {
+    aa: mat4x4<f32>,
+    ab: mat4x4<f32>,
+    ba: mat4x4<f32>,
+    bb: mat4x4<f32>,
+    a: vec4<f32>,
+    b: vec4<f32>,
+}
+
+// Adds the products of row k of the sixteen.
+fn multiply_add(sums: ptr<function, Sums>, local: vec3<u32>, k: u32) {
+    let ya = y_tile[16u * k + local.y];
+    let yb = y_tile[16u * k + local.y + 8u];
+    let xa = x_tile[16u * k + local.x];
+    let xb = x_tile[16u * k + local.x + 8u];
+    (*sums).aa += outer(ya, xa);
+    (*sums).ab += outer(ya, xb);
+    (*sums).ba += outer(yb, xa);
+    (*sums).bb += outer(yb, xb);
+    (*sums).a += ya;
+    (*sums).b += yb;
 }
 
 fn put(at: u32, sum: vec4<f32>) {
@@ -70,55 +93,54 @@ fn main(
     let y_stride = params.out_features / 4u;
     let x_column = min(first_in / 4u + index % 16u, x_stride - 1u);
     let y_column = min(first_out / 4u + index % 16u, y_stride - 1u);
-    let to = 17u * 4u * (index / 16u) + index % 16u;
+    let to = 64u * (index / 16u) + index % 16u;
 
-    var w_aa: mat4x4<f32>;
-    var w_ab: mat4x4<f32>;
-    var w_ba: mat4x4<f32>;
-    var w_bb: mat4x4<f32>;
-    var bias_a = vec4(0.0);
-    var bias_b = vec4(0.0);
+    var sums: Sums;
     for (var first = begin; first < end; first += 16u) {
-        let row = min(first + 4u * (index / 16u) + vec4(0u, 1u, 2u, 3u), vec4(end - 1u));
-        let x_at = row * x_stride + x_column;
-        let y_at = row * y_stride + y_column;
-        let xs = mat4x4(x[x_at.x], x[x_at.y], x[x_at.z], x[x_at.w]);
-        let ys = mat4x4(d_y[y_at.x], d_y[y_at.y], d_y[y_at.z], d_y[y_at.w]);
+        let row = first + 4u * (index / 16u) + vec4(0u, 1u, 2u, 3u);
+        let x_at = min(row, vec4(end - 1u)) * x_stride + x_column;
+        let y_at = min(row, vec4(end - 1u)) * y_stride + y_column;
+        // Nothing beyond the last row.
+        let within = select(vec4(0.0), vec4(1.0), row < vec4(end));
         workgroupBarrier();
-        x_tile[to] = xs[0];
-        x_tile[to + 17u] = xs[1];
-        x_tile[to + 34u] = xs[2];
-        x_tile[to + 51u] = xs[3];
-        y_tile[to] = ys[0];
-        y_tile[to + 17u] = ys[1];
-        y_tile[to + 34u] = ys[2];
-        y_tile[to + 51u] = ys[3];
+        x_tile[to] = x[x_at.x];
+        x_tile[to + 16u] = x[x_at.y];
+        x_tile[to + 32u] = x[x_at.z];
+        x_tile[to + 48u] = x[x_at.w];
+        y_tile[to] = d_y[y_at.x] * within.x;
+        y_tile[to + 16u] = d_y[y_at.y] * within.y;
+        y_tile[to + 32u] = d_y[y_at.z] * within.z;
+        y_tile[to + 48u] = d_y[y_at.w] * within.w;
         workgroupBarrier();
-        for (var k = 0u; k < min(end - first, 16u); k++) {
-            let ya = y_tile[17u * k + 2u * local.y];
-            let yb = y_tile[17u * k + 2u * local.y + 1u];
-            let xa = x_tile[17u * k + 2u * local.x];
-            let xb = x_tile[17u * k + 2u * local.x + 1u];
-            w_aa += outer(ya, xa);
-            w_ab += outer(ya, xb);
-            w_ba += outer(yb, xa);
-            w_bb += outer(yb, xb);
-            bias_a += ya;
-            bias_b += yb;
-        }
+        multiply_add(&sums, local, 0u);
+        multiply_add(&sums, local, 1u);
+        multiply_add(&sums, local, 2u);
+        multiply_add(&sums, local, 3u);
+        multiply_add(&sums, local, 4u);
+        multiply_add(&sums, local, 5u);
+        multiply_add(&sums, local, 6u);
+        multiply_add(&sums, local, 7u);
+        multiply_add(&sums, local, 8u);
+        multiply_add(&sums, local, 9u);
+        multiply_add(&sums, local, 10u);
+        multiply_add(&sums, local, 11u);
+        multiply_add(&sums, local, 12u);
+        multiply_add(&sums, local, 13u);
+        multiply_add(&sums, local, 14u);
+        multiply_add(&sums, local, 15u);
     }
-    let out = first_out + 8u * local.y;
-    let in_ = first_in + 8u * local.x;
+    let out = first_out + 4u * local.y;
+    let in_ = first_in + 4u * local.x;
     let weight = workgroup.z * (params.out_features * params.in_features + params.out_features) / 4u;
-    store(weight, out, in_, w_aa);
-    store(weight, out, in_ + 4u, w_ab);
-    store(weight, out + 4u, in_, w_ba);
-    store(weight, out + 4u, in_ + 4u, w_bb);
+    store(weight, out, in_, sums.aa);
+    store(weight, out, in_ + 32u, sums.ab);
+    store(weight, out + 32u, in_, sums.ba);
+    store(weight, out + 32u, in_ + 32u, sums.bb);
     if (in_ == 0u && out < params.out_features) {
         let bias = weight + (params.out_features * params.in_features + out) / 4u;
-        put(bias, bias_a);
-        if (out + 4u < params.out_features) {
-            put(bias + 1u, bias_b);
+        put(bias, sums.a);
+        if (out + 32u < params.out_features) {
+            put(bias + 8u, sums.b);
         }
     }
 }

@@ -23,12 +23,12 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> y: array<vec4<f32>>;
 
-// Rows of x and rows of W, 32 features of each; eight more, so that successive rows begin in different banks.
-const STRIDE: u32 = 40u;
-var<workgroup> x_high: array<f16, 2560>;
-var<workgroup> x_low: array<f16, 2560>;
-var<workgroup> w_high: array<f16, 2560>;
-var<workgroup> w_low: array<f16, 2560>;
+// Rows of x and rows of W, 32 features of each, in vectors of four; two vectors more, so that successive rows begin in different banks.
+const STRIDE: u32 = 10u;
+var<workgroup> x_high: array<vec4<f16>, 640>;
+var<workgroup> x_low: array<vec4<f16>, 640>;
+var<workgroup> w_high: array<vec4<f16>, 640>;
+var<workgroup> w_low: array<vec4<f16>, 640>;
 // The largest value of each row of x, as the bits of a float, whose order is that of integers.
 var<workgroup> largest: array<atomic<u32>, 64>;
 // A matrix of sums for each subgroup.
@@ -36,6 +36,9 @@ var<workgroup> sums: array<f32, 1024>;
 
 // Each subgroup has 2 × 2 matrices of the 64 × 64 results.
 const INVOCATIONS: u32 = 1024u / (SIDE * SIDE) * LANES;
+
+// How many invocations look for the largest value of a row.
+const SHARES: u32 = max(INVOCATIONS / 64u, 1u);
 
 // Where the weights of a group begin, in elements.
 fn weights_of(group: u32) -> u32 {
@@ -54,8 +57,8 @@ fn exponent(row: u32) -> u32 {
 }
 
 // The first 11 digits: what f16 holds. By bits, since a driver may take there and back again for the number itself.
-fn high(value: f32) -> f32 {
-    return bitcast<f32>(bitcast<u32>(value) & 0xffffe000u);
+fn high(values: vec4<f32>) -> vec4<f32> {
+    return bitcast<vec4<f32>>(bitcast<vec4<u32>>(values) & vec4(0xffffe000u));
 }
 
 fn put(group: u32, row: u32, out: u32, sum: vec4<f32>, bias: u32) {
@@ -94,9 +97,18 @@ fn main(
         sums[i] = 0.0;
     }
     workgroupBarrier();
-    for (var i = index; i < 64u * n; i += INVOCATIONS) {
-        let v = abs(x[x_first + min(first_row + i / n, last_row) * n + i % n]);
-        atomicMax(&largest[i / n], bitcast<u32>(max(max(v.x, v.y), max(v.z, v.w))));
+    for (var r = index / SHARES; r < 64u; r += INVOCATIONS / SHARES) {
+        let at = x_first + min(first_row + r, last_row) * n;
+        var most = vec4(0.0);
+        // Eight at once, which a GPU waits for together.
+        for (var i = index % SHARES; i < n; i += 8u * SHARES) {
+            let a = max(abs(x[at + min(i + 0u * SHARES, n - 1u)]), abs(x[at + min(i + 1u * SHARES, n - 1u)]));
+            let b = max(abs(x[at + min(i + 2u * SHARES, n - 1u)]), abs(x[at + min(i + 3u * SHARES, n - 1u)]));
+            let c = max(abs(x[at + min(i + 4u * SHARES, n - 1u)]), abs(x[at + min(i + 5u * SHARES, n - 1u)]));
+            let d = max(abs(x[at + min(i + 6u * SHARES, n - 1u)]), abs(x[at + min(i + 7u * SHARES, n - 1u)]));
+            most = max(most, max(max(a, b), max(c, d)));
+        }
+        atomicMax(&largest[r], bitcast<u32>(max(max(most.x, most.y), max(most.z, most.w))));
     }
     workgroupBarrier();
 
@@ -117,24 +129,22 @@ fn main(
             let scale = select(0.0, bitcast<f32>(exponent(r) << 23u), k < n);
             let xs = scale * x[x_first + min(first_row + r, last_row) * n + at];
             let ws = W_SCALE * weights[w_first + min(first_out + r, last_out) * n + at];
-            let to = STRIDE * r + 4u * (i % 8u);
-            for (var j = 0u; j < 4u; j++) {
-                x_high[to + j] = f16(high(xs[j]));
-                x_low[to + j] = f16(xs[j] - high(xs[j]));
-                w_high[to + j] = f16(high(ws[j]));
-                w_low[to + j] = f16(ws[j] - high(ws[j]));
-            }
+            let to = STRIDE * r + i % 8u;
+            x_high[to] = vec4<f16>(high(xs));
+            x_low[to] = vec4<f16>(xs - high(xs));
+            w_high[to] = vec4<f16>(high(ws));
+            w_low[to] = vec4<f16>(ws - high(ws));
         }
         workgroupBarrier();
         for (var k = 0u; k < 32u; k += SIDE) {
-            let xa = coopLoadT<Left>(&x_high[STRIDE * row + k], STRIDE);
-            let xb = coopLoadT<Left>(&x_high[STRIDE * (row + SIDE) + k], STRIDE);
-            let wa = coopLoad<Right>(&w_high[STRIDE * out + k], STRIDE);
-            let wb = coopLoad<Right>(&w_high[STRIDE * (out + SIDE) + k], STRIDE);
-            let xa_low = coopLoadT<Left>(&x_low[STRIDE * row + k], STRIDE);
-            let xb_low = coopLoadT<Left>(&x_low[STRIDE * (row + SIDE) + k], STRIDE);
-            let wa_low = coopLoad<Right>(&w_low[STRIDE * out + k], STRIDE);
-            let wb_low = coopLoad<Right>(&w_low[STRIDE * (out + SIDE) + k], STRIDE);
+            let xa = coopLoadT<Left>(&x_high[STRIDE * row + k / 4u], STRIDE);
+            let xb = coopLoadT<Left>(&x_high[STRIDE * (row + SIDE) + k / 4u], STRIDE);
+            let wa = coopLoad<Right>(&w_high[STRIDE * out + k / 4u], STRIDE);
+            let wb = coopLoad<Right>(&w_high[STRIDE * (out + SIDE) + k / 4u], STRIDE);
+            let xa_low = coopLoadT<Left>(&x_low[STRIDE * row + k / 4u], STRIDE);
+            let xb_low = coopLoadT<Left>(&x_low[STRIDE * (row + SIDE) + k / 4u], STRIDE);
+            let wa_low = coopLoad<Right>(&w_low[STRIDE * out + k / 4u], STRIDE);
+            let wb_low = coopLoad<Right>(&w_low[STRIDE * (out + SIDE) + k / 4u], STRIDE);
             y_aa = coopMultiplyAdd(xa, wa, coopMultiplyAdd(xa, wa_low, coopMultiplyAdd(xa_low, wa, y_aa)));
             y_ab = coopMultiplyAdd(xa, wb, coopMultiplyAdd(xa, wb_low, coopMultiplyAdd(xa_low, wb, y_ab)));
             y_ba = coopMultiplyAdd(xb, wa, coopMultiplyAdd(xb, wa_low, coopMultiplyAdd(xb_low, wa, y_ba)));

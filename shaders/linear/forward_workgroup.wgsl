@@ -23,10 +23,10 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> y: array<vec4<f32>>;
 
-// Sixteen input features of a tile, each of 64 rows and of 64 output features, in vectors of four; a row is one longer than it need be, so
-// that successive rows begin in different banks.
-var<workgroup> x_tile: array<vec4<f32>, 272>;
-var<workgroup> w_tile: array<vec4<f32>, 272>;
+// Sixteen input features of a tile, each of 64 rows and of 64 output features, in vectors of four. Where a vector stands among the sixteen of its
+// feature is crossed with the feature's number, so that eight successive invocations write to different banks.
+var<workgroup> x_tile: array<vec4<f32>, 256>;
+var<workgroup> w_tile: array<vec4<f32>, 256>;
 
 // Where the weights of a group begin, in elements.
 fn weights_of(group: u32) -> u32 {
@@ -41,23 +41,46 @@ fn outer(row: vec4<f32>, column: vec4<f32>) -> mat4x4<f32> {
     return mat4x4(column * row.x, column * row.y, column * row.z, column * row.w);
 }
 
-// Columns are rows of y.
-fn store(group: u32, row: u32, out: u32, tile: mat4x4<f32>, bias: u32) {
+// What an invocation computes: rows 4 ly and 32 + 4 ly, a and b, output features 4 lx and 32 + 4 lx.
+struct Sums {
+    aa: mat4x4<f32>,
+    ab: mat4x4<f32>,
+    ba: mat4x4<f32>,
+    bb: mat4x4<f32>,
+}
+
+// Adds the products of feature k of the sixteen.
+fn multiply_add(sums: ptr<function, Sums>, local: vec3<u32>, k: u32) {
+    let crossed = 2u * (k / 4u);
+    let xa = x_tile[16u * k + (local.y ^ crossed)];
+    let xb = x_tile[16u * k + ((local.y + 8u) ^ crossed)];
+    let wa = w_tile[16u * k + (local.x ^ crossed)];
+    let wb = w_tile[16u * k + ((local.x + 8u) ^ crossed)];
+    (*sums).aa += outer(xa, wa);
+    (*sums).ab += outer(xa, wb);
+    (*sums).ba += outer(xb, wa);
+    (*sums).bb += outer(xb, wb);
+}
+
+fn put(group: u32, row: u32, out: u32, sum: vec4<f32>) {
     if (row >= params.rows_per_group || out >= params.out_features) {
         return;
     }
-    let b = weights[bias + out / 4u];
     let at = ((group * params.rows_per_group + row) * params.out_features + out) / 4u;
-    let stride = params.out_features / 4u;
-    let count = min(params.rows_per_group - min(row, params.rows_per_group), 4u);
-    var columns = tile;
-    for (var r = 0u; r < count; r++) {
-        var value = columns[r] + b;
-        if (params.accumulate == 1u) {
-            value += y[at + r * stride];
-        }
-        y[at + r * stride] = value;
+    var value = sum;
+    if (params.accumulate == 1u) {
+        value += y[at];
     }
+    y[at] = value;
+}
+
+// Columns are rows of y.
+fn store(group: u32, row: u32, out: u32, tile: mat4x4<f32>, first_bias: u32) {
+    let bias = weights[first_bias + min(out, params.out_features - 1u) / 4u];
+    put(group, row, out, tile[0] + bias);
+    put(group, row + 1u, out, tile[1] + bias);
+    put(group, row + 2u, out, tile[2] + bias);
+    put(group, row + 3u, out, tile[3] + bias);
 }
 
 @compute @workgroup_size(8, 8)
@@ -76,44 +99,49 @@ fn main(
     let x_row = group * params.rows_per_group + min(first_row + 4u * four + vec4(0u, 1u, 2u, 3u), vec4(params.rows_per_group - 1u));
     let w_first = weights_of(group) / 4u;
     let w_row = min(first_out + 4u * four + vec4(0u, 1u, 2u, 3u), vec4(params.out_features - 1u));
-    let to = 17u * 4u * feature + four;
+    let to = 64u * feature + (four ^ (2u * feature));
 
-    var y_aa: mat4x4<f32>;
-    var y_ab: mat4x4<f32>;
-    var y_ba: mat4x4<f32>;
-    var y_bb: mat4x4<f32>;
+    var sums: Sums;
     for (var first = 0u; first < n; first += 4u) {
+        // Nothing beyond the last feature.
         let i = min(first + feature, n - 1u);
+        let within = select(0.0, 1.0, first + feature < n);
         let x_at = x_row * n + i;
-        let w_at = w_first + w_row * n + i;
-        let xs = transpose(mat4x4(x[x_at.x], x[x_at.y], x[x_at.z], x[x_at.w]));
-        let ws = transpose(mat4x4(weights[w_at.x], weights[w_at.y], weights[w_at.z], weights[w_at.w]));
+        let w_at = w_row * n + i;
+        let xs = transpose(mat4x4(x[x_at.x], x[x_at.y], x[x_at.z], x[x_at.w])) * within;
+        let ws = transpose(mat4x4(weights[w_first + w_at.x], weights[w_first + w_at.y], weights[w_first + w_at.z], weights[w_first + w_at.w]));
         workgroupBarrier();
         x_tile[to] = xs[0];
-        x_tile[to + 17u] = xs[1];
-        x_tile[to + 34u] = xs[2];
-        x_tile[to + 51u] = xs[3];
+        x_tile[to + 16u] = xs[1];
+        x_tile[to + 32u] = xs[2];
+        x_tile[to + 48u] = xs[3];
         w_tile[to] = ws[0];
-        w_tile[to + 17u] = ws[1];
-        w_tile[to + 34u] = ws[2];
-        w_tile[to + 51u] = ws[3];
+        w_tile[to + 16u] = ws[1];
+        w_tile[to + 32u] = ws[2];
+        w_tile[to + 48u] = ws[3];
         workgroupBarrier();
-        for (var k = 0u; k < 4u * min(n - first, 4u); k++) {
-            let xa = x_tile[17u * k + 2u * local.y];
-            let xb = x_tile[17u * k + 2u * local.y + 1u];
-            let wa = w_tile[17u * k + 2u * local.x];
-            let wb = w_tile[17u * k + 2u * local.x + 1u];
-            y_aa += outer(xa, wa);
-            y_ab += outer(xa, wb);
-            y_ba += outer(xb, wa);
-            y_bb += outer(xb, wb);
-        }
+        multiply_add(&sums, local, 0u);
+        multiply_add(&sums, local, 1u);
+        multiply_add(&sums, local, 2u);
+        multiply_add(&sums, local, 3u);
+        multiply_add(&sums, local, 4u);
+        multiply_add(&sums, local, 5u);
+        multiply_add(&sums, local, 6u);
+        multiply_add(&sums, local, 7u);
+        multiply_add(&sums, local, 8u);
+        multiply_add(&sums, local, 9u);
+        multiply_add(&sums, local, 10u);
+        multiply_add(&sums, local, 11u);
+        multiply_add(&sums, local, 12u);
+        multiply_add(&sums, local, 13u);
+        multiply_add(&sums, local, 14u);
+        multiply_add(&sums, local, 15u);
     }
-    let row = first_row + 8u * local.y;
-    let out = first_out + 8u * local.x;
+    let row = first_row + 4u * local.y;
+    let out = first_out + 4u * local.x;
     let bias = w_first + params.out_features * n;
-    store(group, row, out, y_aa, bias);
-    store(group, row, out + 4u, y_ab, bias);
-    store(group, row + 4u, out, y_ba, bias);
-    store(group, row + 4u, out + 4u, y_bb, bias);
+    store(group, row, out, sums.aa, bias);
+    store(group, row, out + 32u, sums.ab, bias);
+    store(group, row + 32u, out, sums.ba, bias);
+    store(group, row + 32u, out + 32u, sums.bb, bias);
 }

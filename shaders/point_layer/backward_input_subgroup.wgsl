@@ -1,5 +1,5 @@
 // z = W x + b, x̂ = (z - mean) rstd, e = gamma d_y where y > 0, else 0; d_z = rstd (e - mean(e) - x̂ mean(e x̂)), means over the features; d_x[r, i] (+)= Σ_j W[j, i] d_z[r, j], weights at slots[first_group + r / rows_per_group] · weight_stride.
-// One invocation holds the weights of eight vectors of features, less their mean over the features, in registers; eight lanes add up what belongs to a row. 32 rows in turn.
+// One invocation holds the weights of eight vectors of features, less their mean over the features, in registers; eight lanes add up what belongs to a row, and take as many turns as there are rows for each such team.
 // x [groups, rows_per_group, 3], weights [.., 3 features + features], slots [..], affine [2, features] = (gamma, beta), d_y [groups, rows_per_group, features] → d_x [groups, rows_per_group, 3]; features a multiple of 4, at most 256.
 // ACCUMULATES d_x where accumulate is 1, else OVERWRITES it.
 
@@ -119,22 +119,25 @@ fn put(at: u32, value: f32) {
 @compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(subgroup_id) subgroup: u32,
     @builtin(subgroup_size) subgroup_size: u32,
     @builtin(subgroup_invocation_id) lane: u32,
 ) {
-    // Eight lanes of a subgroup do 32 rows, whatever its size: 1, 2, 4 or 8 vectors of each make a row.
+    // Eight lanes of a subgroup are a team, whatever its size: 1, 2, 4 or 8 vectors of each make a row.
     let n = params.features / 4u;
     let per_row = select(select(select(1u, 2u, n > 8u), 4u, n > 16u), 8u, n > 32u);
     let member = lane % 8u;
     let octet = lane - member;
     let team = (subgroup * subgroup_size + lane) / 8u;
-    let first = 128u * workgroup.x + 32u * team;
+    let turn = 8u / per_row;
+    let first = turn * (4u * workgroup.x + team);
+    let all_teams = 4u * workgroups.x;
     let group = workgroup.z;
     if (first >= params.rows_per_group) {
         return;
     }
-    let end = min(first + 32u, params.rows_per_group);
+    let end = params.rows_per_group;
     let first_weight = weights_of(group) / 4u;
     // Columns of the vectors.
     let c0 = member;
@@ -198,7 +201,7 @@ fn main(
     let beta5 = affine[n + j5];
     let beta6 = affine[n + j6];
     let beta7 = affine[n + j7];
-    for (var row = first; row < end; row += 8u / per_row) {
+    for (var row = first; row < end; row += turn * all_teams) {
         // Each lane loads the point of one row.
         let of_mine = 3u * (group * params.rows_per_group + min(row + member, end - 1u));
         let mine = vec3(x[of_mine], x[of_mine + 1u], x[of_mine + 2u]);

@@ -80,8 +80,10 @@ impl Cooperative {
 /// One WGSL text that computes a kernel; every kernel has at least one, and its plain form runs everywhere.
 #[derive(Clone, Copy, Debug)]
 pub struct Variant {
-    /// File name without the extension, unique within the kernel.
+    /// Unique within the kernel.
     pub name: &'static str,
+    /// File name without the extension: the name, but for a form that is another one with more or fewer rows to a workgroup.
+    pub file: &'static str,
     /// The WGSL text of the file.
     pub text: &'static str,
     /// Elements of the step's extent that one workgroup covers, per dimension.

@@ -13,6 +13,7 @@ use sigma_srn::{
     Descent, Engine, Gpu, Intrinsics, Loss, Method, Model, ModelConfig, Options, Outline, Phase, Pose6, Query, Rays, Renderer,
     Shape, Train, Trainer, TrainingBatch, camera, estimate, pixel_grid, stream,
 };
+use srn_gpu::KernelTime;
 use srn_tests::between;
 use srn_tests::peer::Peer;
 
@@ -78,6 +79,8 @@ struct Scaling {
 /// Time of one kernel in one run of a stage.
 #[derive(serde::Serialize)]
 struct KernelRow {
+    /// `pose step` or `training step`.
+    work: &'static str,
     width: u32,
     executor: &'static str,
     kernel: String,
@@ -177,6 +180,9 @@ fn run() -> Result<()> {
                 }
             }
             report.kernels.extend(bench.profile(bench.name())?);
+            if bench.is_gpu() {
+                report.kernels.extend(bench.profile_training(bench.name())?);
+            }
         }
         // Where there are cooperative matrices, a pose step with them, and what they change.
         if let Ok(gpu) = Gpu::open_cooperative(None) {
@@ -275,12 +281,12 @@ impl Report {
             let each = 1e6 * seconds / f64::from(*rays);
             text += &format!("| {executor} | {hypotheses} | {side} | {rays} | {:.1} ms | {each:.2} |\n", 1e3 * seconds);
         }
-        text += "\nKernels of a pose step of Adam, each timed alone:\n\n";
-        text += "| width | executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|---|\n";
-        for of_one in self.kernels.chunk_by(|a, b| (a.width, a.executor) == (b.width, b.executor)) {
-            for KernelRow { width, executor, kernel, steps, seconds, flops } in of_one.iter().take(8) {
+        text += "\nKernels of a pose step of Adam, and on a GPU of a training step, each timed alone:\n\n";
+        text += "| work | width | executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|---|---|\n";
+        for of_one in self.kernels.chunk_by(|a, b| (a.work, a.width, a.executor) == (b.work, b.width, b.executor)) {
+            for KernelRow { work, width, executor, kernel, steps, seconds, flops } in of_one.iter().take(8) {
                 let rate = if *flops == 0 { String::new() } else { format!("{:.1}", *flops as f64 / seconds / 1e9) };
-                text += &format!("| {width} | {executor} | `{kernel}` | {steps} | {:.1} | {rate} |\n", 1e3 * seconds);
+                text += &format!("| {work} | {width} | {executor} | `{kernel}` | {steps} | {:.1} | {rate} |\n", 1e3 * seconds);
             }
         }
         text
@@ -412,12 +418,17 @@ impl Bench<'_> {
         Ok(self.engine.cooperative_difference().unwrap_or(f64::NAN))
     }
 
-    fn training_step(&self) -> Result<Work> {
+    fn trainer(&self) -> Result<(Trainer, TrainingBatch)> {
         const IMAGES: u32 = 10;
-        let mut trainer = Trainer::new(self.engine, self.model.clone(), Train::Everything, IMAGES, RAYS)?;
+        let trainer = Trainer::new(self.engine, self.model.clone(), Train::Everything, IMAGES, RAYS)?;
         let instances = (0..IMAGES).map(|image| image % 9).collect();
         let batch =
             TrainingBatch { instances, rays: rays(IMAGES, SIDE, RAYS), target_rgb: target(3 * IMAGES * RAYS), weights: None };
+        Ok((trainer, batch))
+    }
+
+    fn training_step(&self) -> Result<Work> {
+        let (mut trainer, batch) = self.trainer()?;
         let plan = trainer.executor().plan();
         let flops = plan.stages.iter().flat_map(|stage| &stage.steps).map(|step| step.flops).sum();
         let bytes = plan.bytes();
@@ -438,10 +449,29 @@ impl Bench<'_> {
         }))
     }
 
+    /// Time of each kernel of a training step, on a GPU.
+    fn profile_training(&self, executor: &'static str) -> Result<Vec<KernelRow>> {
+        let width = self.model.layout.features();
+        let (mut trainer, batch) = self.trainer()?;
+        trainer.gradients(&batch)?;
+        let times = trainer.profile()?.unwrap_or_default().into_iter();
+        let row = |KernelTime { label: kernel, steps, seconds, flops }| KernelRow {
+            work: "training step",
+            width,
+            executor,
+            kernel,
+            steps,
+            seconds,
+            flops,
+        };
+        Ok(times.map(row).collect())
+    }
+
     /// Time of each kernel of a pose step: from the device's clock on a GPU, from ours on the CPU.
     fn profile(&self, executor: &'static str) -> Result<Vec<KernelRow>> {
         let width = self.model.layout.features();
-        let row = |(kernel, (steps, seconds, flops))| KernelRow { width, executor, kernel, steps, seconds, flops };
+        let row =
+            |(kernel, (steps, seconds, flops))| KernelRow { work: "pose step", width, executor, kernel, steps, seconds, flops };
         let rows_alone = |engine: &Engine| if self.is_gpu() { engine.clone() } else { engine.clone().with_tile_rows(ALONE_ROWS) };
         let mut descent = Bench { engine: &rows_alone(self.engine), ..*self }.descent(ADAM, BATCH, SIDE)?;
         descent.evaluate()?;

@@ -18,6 +18,10 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_vec4", "head[4u * k + 2u]", "head[4u * k + 1u]"),
         ("forward_vec4", "dot(sums, vec4(1.0))", "sums.x"),
         ("forward_vec4", "accumulate == 1u", "accumulate == 0u"),
+        ("forward_subgroup", "subgroupShuffleXor(sigma, 4u)", "subgroupShuffleXor(sigma, 2u)"),
+        ("forward_subgroup", "+= head[params.in_features]", "+= head[0]"),
+        ("forward_subgroup", "row = 8u *", "row = 4u *"),
+        ("forward_subgroup", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 
@@ -34,6 +38,10 @@ pub static BACKWARD: KernelTest = KernelTest {
         ("backward_vec4", "dot(sums, vec4(1.0))", "sums.x"),
         ("backward_vec4", "total * weights(k)", "sigma * weights(k)"),
         ("backward_vec4", "head[4u * k + 3u]", "head[4u * k]"),
+        ("backward_subgroup", "subgroupShuffleXor(total, 1u)", "subgroupShuffleXor(total, 2u)"),
+        ("backward_subgroup", "sigma * gradient", "sigma * feature[j]"),
+        ("backward_subgroup", "total * weights(k)", "sigma * weights(k)"),
+        ("backward_subgroup", "row = 8u *", "row = 4u *"),
     ],
 };
 

@@ -27,6 +27,7 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_subgroup", "b + b.zwxy, per_row > 2u", "b + b.zwxy, per_row > 4u"),
         ("forward_subgroup", "subgroupShuffleXor(a, 4u)", "subgroupShuffleXor(a, 2u)"),
         ("forward_subgroup", "pick(rstd, lane % 8u * per_row)", "pick(rstd, lane % 8u)"),
+        ("forward_short", "turn * (4u * (workgroup", "turn * (3u * (workgroup"),
     ],
 };
 
@@ -47,10 +48,11 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
         ("backward_input_subgroup", "params.centred == 0u", "true"),
         ("backward_input_subgroup", "mean.a.y - x1", "mean.a.x - x1"),
         ("backward_input_subgroup", "passes & vec4(column < params.features / 4u)", "passes"),
-        ("backward_input_subgroup", "row += 8u / per_row", "row += 8u"),
+        ("backward_input_subgroup", "turn = 8u / per_row", "turn = 8u"),
         ("backward_input_subgroup", "octet + 5u / per_row", "octet"),
         ("backward_input_subgroup", "subgroupShuffleXor(b, 1u)", "subgroupShuffleXor(b, 4u)"),
         ("backward_input_subgroup", "dot(e6, x6)", "dot(e6, e6)"),
+        ("backward_input_short", "turn * (4u * (workgroup", "turn * (3u * (workgroup"),
     ],
 };
 
@@ -69,6 +71,10 @@ pub static BACKWARD_AFFINE: KernelTest = KernelTest {
         ("backward_affine_vec4", "chunk * params.chunk_rows", "0u * params.chunk_rows"),
         ("backward_affine_vec4", "id.y / params.chunks", "0u / params.chunks"),
         ("backward_affine_vec4", "accumulate == 1u", "accumulate == 0u"),
+        ("backward_affine_workgroup", "> vec4(0.0)", "< vec4(0.0)"),
+        ("backward_affine_workgroup", "passes & vec4(row + k < end)", "passes"),
+        ("backward_affine_workgroup", "d_gammas[other]", "d_gammas[own]"),
+        ("backward_affine_workgroup", "accumulate == 1u", "accumulate == 0u"),
     ],
 };
 

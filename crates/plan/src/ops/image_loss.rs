@@ -6,7 +6,7 @@ use super::{overwrite, read, size, sum};
 use crate::{BufferId, Builder, PlanError, Rows};
 
 /// Rows per partial sum.
-const CHUNK_ROWS: u32 = 256;
+const CHUNK_ROWS: u32 = 64;
 
 /// Which sum, and divided by what.
 #[derive(Clone, Copy, Debug, PartialEq)]
