@@ -1,6 +1,6 @@
-// d_x[r, i] (+)= Σ_o W[o, i] d_y[r, o] for o in first_out .. end_out, d_y and W as sums of two numbers in f16, weights at slots[first_group + r / rows_per_group] · weight_stride.
-// One invocation copies its part of 64 rows × 64 input features, 32 output features at a time; its subgroup multiplies 2 × 2 matrices of SIDE × SIDE of them.
-// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, rows_per_group, in]; in, out and both ends multiples of 4.
+// d_x[r, i] (+)= Σ_o W[o, i] d_y[r, o] for all o, which are no more than one step may sum, d_y and W as sums of two numbers in f16, weights at slots[first_group + r / rows_per_group] · weight_stride.
+// One invocation copies its part of 64 rows × 128 input features, 16 output features at a time; its subgroup multiplies 2 × 4 matrices of SIDE × SIDE of them.
+// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, rows_per_group, in]; in and out multiples of 4.
 // ACCUMULATES d_x where accumulate is 1, else OVERWRITES it.
 
 struct Params {
@@ -23,24 +23,21 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> d_x: array<vec4<f32>>;
 
-// Rows of d_y, 32 features of each, and 32 rows of W, 64 features of each, in vectors of four; two vectors more, so that successive rows begin in
+// Rows of d_y, 16 features of each, and 16 rows of W, 128 features of each, in vectors of four; two vectors more, so that successive rows begin in
 // different banks.
-const Y_STRIDE: u32 = 10u;
-const W_STRIDE: u32 = 18u;
-var<workgroup> y_high: array<vec4<f16>, 640>;
-var<workgroup> y_low: array<vec4<f16>, 640>;
-var<workgroup> w_high: array<vec4<f16>, 576>;
-var<workgroup> w_low: array<vec4<f16>, 576>;
+const Y_STRIDE: u32 = 6u;
+const W_STRIDE: u32 = 34u;
+var<workgroup> y_high: array<vec4<f16>, 384>;
+var<workgroup> y_low: array<vec4<f16>, 384>;
+var<workgroup> w_high: array<vec4<f16>, 544>;
+var<workgroup> w_low: array<vec4<f16>, 544>;
 // The largest value of each row of d_y, as the bits of a float, whose order is that of integers.
 var<workgroup> largest: array<atomic<u32>, 64>;
 // A matrix of sums for each subgroup.
-var<workgroup> sums: array<f32, 1024>;
+var<workgroup> sums: array<vec4<f32>, 256>;
 
-// Each subgroup has 2 × 2 matrices of the 64 × 64 results.
+// Each subgroup has 2 × 4 matrices of the 64 × 128 results.
 const INVOCATIONS: u32 = 1024u / (SIDE * SIDE) * LANES;
-
-// How many invocations look for the largest value of a row.
-const SHARES: u32 = max(INVOCATIONS / 64u, 1u);
 
 // Where the weights of a group begin, in elements.
 fn weights_of(group: u32) -> u32 {
@@ -63,6 +60,20 @@ fn high(values: vec4<f32>) -> vec4<f32> {
     return bitcast<vec4<f32>>(bitcast<vec4<u32>>(values) & vec4(0xffffe000u));
 }
 
+fn most(values: vec4<f32>) -> f32 {
+    return max(max(values.x, values.y), max(values.z, values.w));
+}
+
+fn keep_y(at: u32, values: vec4<f32>) {
+    y_high[at] = vec4<f16>(high(values));
+    y_low[at] = vec4<f16>(values - high(values));
+}
+
+fn keep_w(at: u32, values: vec4<f32>) {
+    w_high[at] = vec4<f16>(high(values));
+    w_low[at] = vec4<f16>(values - high(values));
+}
+
 fn put(group: u32, row: u32, in_: u32, sum: vec4<f32>) {
     if (row >= params.rows_per_group || in_ >= params.in_features) {
         return;
@@ -75,6 +86,15 @@ fn put(group: u32, row: u32, in_: u32, sum: vec4<f32>) {
     d_x[at] = value;
 }
 
+// From the subgroup's matrix of sums; its row and feature within the tile.
+fn put_matrix(workgroup: vec3<u32>, own: u32, lane: u32, row: u32, in_: u32) {
+    for (var i = lane; i < SIDE * SIDE / 4u; i += LANES) {
+        let r = row + i / (SIDE / 4u);
+        let scale = bitcast<f32>((254u - exponent(r)) << 23u) / W_SCALE;
+        put(workgroup.z, 64u * workgroup.x + r, 128u * workgroup.y + in_ + 4u * (i % (SIDE / 4u)), scale * sums[own + i]);
+    }
+}
+
 @compute @workgroup_size(INVOCATIONS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -83,102 +103,144 @@ fn main(
     @builtin(subgroup_invocation_id) lane: u32,
 ) {
     let first_row = 64u * workgroup.x;
-    let first_in = 64u * workgroup.y;
-    let group = workgroup.z;
+    let first_in = 128u * workgroup.y;
     let n = params.out_features / 4u;
-    let begin = params.first_out / 4u;
-    let end = params.end_out / 4u;
     // The last row and the last feature stand in for those beyond them.
-    let y_first = group * params.rows_per_group * n;
+    let d_y_first = workgroup.z * params.rows_per_group * n;
     let last_row = params.rows_per_group - 1u;
     let stride = params.in_features / 4u;
-    let w_first = weights_of(group) / 4u + first_in / 4u;
-    let last_in = stride - 1u - first_in / 4u;
+    let w_first = weights_of(workgroup.z) / 4u;
+    let own = SIDE * SIDE / 4u * subgroup;
 
-    for (var i = index; i < 64u; i += INVOCATIONS) {
-        atomicStore(&largest[i], 0u);
+    if (index < 64u) {
+        atomicStore(&largest[index], 0u);
     }
-    for (var i = index; i < 1024u; i += INVOCATIONS) {
-        sums[i] = 0.0;
-    }
+    sums[index] = vec4(0.0);
+    sums[index + 128u] = vec4(0.0);
     workgroupBarrier();
-    for (var r = index / SHARES; r < 64u; r += INVOCATIONS / SHARES) {
-        let at = y_first + min(first_row + r, last_row) * n;
-        var most = vec4(0.0);
-        // Eight at once, which a GPU waits for together.
-        for (var i = begin + index % SHARES; i < end; i += 8u * SHARES) {
-            let a = max(abs(d_y[at + min(i + 0u * SHARES, end - 1u)]), abs(d_y[at + min(i + 1u * SHARES, end - 1u)]));
-            let b = max(abs(d_y[at + min(i + 2u * SHARES, end - 1u)]), abs(d_y[at + min(i + 3u * SHARES, end - 1u)]));
-            let c = max(abs(d_y[at + min(i + 4u * SHARES, end - 1u)]), abs(d_y[at + min(i + 5u * SHARES, end - 1u)]));
-            let d = max(abs(d_y[at + min(i + 6u * SHARES, end - 1u)]), abs(d_y[at + min(i + 7u * SHARES, end - 1u)]));
-            most = max(most, max(max(a, b), max(c, d)));
+    {
+        // Two invocations look for the largest value of a row; eight vectors at once, which a GPU waits for together.
+        let at = d_y_first + min(first_row + index / 2u, last_row) * n;
+        var values = vec4(0.0);
+        for (var i = index % 2u; i < n; i += 16u) {
+            let a = max(abs(d_y[at + min(i + 0u, n - 1u)]), abs(d_y[at + min(i + 2u, n - 1u)]));
+            let b = max(abs(d_y[at + min(i + 4u, n - 1u)]), abs(d_y[at + min(i + 6u, n - 1u)]));
+            let c = max(abs(d_y[at + min(i + 8u, n - 1u)]), abs(d_y[at + min(i + 10u, n - 1u)]));
+            let d = max(abs(d_y[at + min(i + 12u, n - 1u)]), abs(d_y[at + min(i + 14u, n - 1u)]));
+            values = max(values, max(max(a, b), max(c, d)));
         }
-        atomicMax(&largest[r], bitcast<u32>(max(max(most.x, most.y), max(most.z, most.w))));
+        atomicMax(&largest[index / 2u], bitcast<u32>(most(values)));
     }
     workgroupBarrier();
 
     let row = 2u * SIDE * (subgroup / (32u / SIDE));
-    let in_ = 2u * SIDE * (subgroup % (32u / SIDE));
-    let own = SIDE * SIDE * subgroup;
-    var x_aa = coopLoadT<Sums>(&sums[own], SIDE);
-    var x_ab = x_aa;
-    var x_ba = x_aa;
-    var x_bb = x_aa;
-    for (var first = begin; first < end; first += 8u) {
+    let in_ = 4u * SIDE * (subgroup % (32u / SIDE));
+    var x_00 = coopLoadT<Sums>(&sums[own], SIDE / 4u);
+    var x_01 = x_00;
+    var x_02 = x_00;
+    var x_03 = x_00;
+    var x_10 = x_00;
+    var x_11 = x_00;
+    var x_12 = x_00;
+    var x_13 = x_00;
+
+    // What this invocation copies: a vector of each of two rows of d_y, and of four rows of W.
+    let r = index / 4u;
+    let feature = index % 4u;
+    let y_to = Y_STRIDE * r + feature;
+    let y_a = d_y_first + min(first_row + r, last_row) * n;
+    let y_b = d_y_first + min(first_row + r + 32u, last_row) * n;
+    let w_row = index / 32u;
+    let w_to = W_STRIDE * w_row + index % 32u;
+    let w_at = w_first + min(first_in / 4u + index % 32u, stride - 1u);
+    let scale_a = bitcast<f32>(exponent(r) << 23u);
+    let scale_b = bitcast<f32>(exponent(r + 32u) << 23u);
+    var first = 0u;
+    var o = min(first + feature, n - 1u);
+    var w_o = min(4u * first + w_row + vec4(0u, 4u, 8u, 12u), vec4(params.out_features - 1u)) * stride;
+    var ya = d_y[y_a + o];
+    var yb = d_y[y_b + o];
+    var wa = weights[w_at + w_o.x];
+    var wb = weights[w_at + w_o.y];
+    var wc = weights[w_at + w_o.z];
+    var wd = weights[w_at + w_o.w];
+    loop {
+        // Nothing beyond the last feature.
+        let within = select(0.0, 1.0, first + feature < n);
         workgroupBarrier();
-        for (var i = index; i < 512u; i += INVOCATIONS) {
-            let r = i / 8u;
-            let o = first + i % 8u;
-            // Nothing beyond the last feature.
-            let scale = select(0.0, bitcast<f32>(exponent(r) << 23u), o < end);
-            let ys = scale * d_y[y_first + min(first_row + r, last_row) * n + min(o, end - 1u)];
-            let to = Y_STRIDE * r + i % 8u;
-            let ws = W_SCALE * weights[w_first + min(4u * first + i / 16u, 4u * end - 1u) * stride + min(i % 16u, last_in)];
-            let w_to = W_STRIDE * (i / 16u) + i % 16u;
-            y_high[to] = vec4<f16>(high(ys));
-            y_low[to] = vec4<f16>(ys - high(ys));
-            w_high[w_to] = vec4<f16>(high(ws));
-            w_low[w_to] = vec4<f16>(ws - high(ws));
+        keep_y(y_to, within * scale_a * ya);
+        keep_y(y_to + 32u * Y_STRIDE, within * scale_b * yb);
+        keep_w(w_to, W_SCALE * wa);
+        keep_w(w_to + 4u * W_STRIDE, W_SCALE * wb);
+        keep_w(w_to + 8u * W_STRIDE, W_SCALE * wc);
+        keep_w(w_to + 12u * W_STRIDE, W_SCALE * wd);
+        workgroupBarrier();
+        // The next ones are on their way while these are multiplied.
+        first += 4u;
+        o = min(first + feature, n - 1u);
+        w_o = min(4u * first + w_row + vec4(0u, 4u, 8u, 12u), vec4(params.out_features - 1u)) * stride;
+        ya = d_y[y_a + o];
+        yb = d_y[y_b + o];
+        wa = weights[w_at + w_o.x];
+        wb = weights[w_at + w_o.y];
+        wc = weights[w_at + w_o.z];
+        wd = weights[w_at + w_o.w];
+        for (var k = 0u; k < 16u; k += SIDE) {
+            let y0 = coopLoadT<Left>(&y_high[Y_STRIDE * row + k / 4u], Y_STRIDE);
+            let y0_low = coopLoadT<Left>(&y_low[Y_STRIDE * row + k / 4u], Y_STRIDE);
+            let y1 = coopLoadT<Left>(&y_high[Y_STRIDE * (row + SIDE) + k / 4u], Y_STRIDE);
+            let y1_low = coopLoadT<Left>(&y_low[Y_STRIDE * (row + SIDE) + k / 4u], Y_STRIDE);
+            let w0 = coopLoadT<Right>(&w_high[W_STRIDE * k + in_ / 4u], W_STRIDE);
+            let w0_low = coopLoadT<Right>(&w_low[W_STRIDE * k + in_ / 4u], W_STRIDE);
+            let w1 = coopLoadT<Right>(&w_high[W_STRIDE * k + (in_ + SIDE) / 4u], W_STRIDE);
+            let w1_low = coopLoadT<Right>(&w_low[W_STRIDE * k + (in_ + SIDE) / 4u], W_STRIDE);
+            let w2 = coopLoadT<Right>(&w_high[W_STRIDE * k + (in_ + 2u * SIDE) / 4u], W_STRIDE);
+            let w2_low = coopLoadT<Right>(&w_low[W_STRIDE * k + (in_ + 2u * SIDE) / 4u], W_STRIDE);
+            let w3 = coopLoadT<Right>(&w_high[W_STRIDE * k + (in_ + 3u * SIDE) / 4u], W_STRIDE);
+            let w3_low = coopLoadT<Right>(&w_low[W_STRIDE * k + (in_ + 3u * SIDE) / 4u], W_STRIDE);
+            x_00 = coopMultiplyAdd(y0, w0, coopMultiplyAdd(y0, w0_low, coopMultiplyAdd(y0_low, w0, x_00)));
+            x_01 = coopMultiplyAdd(y0, w1, coopMultiplyAdd(y0, w1_low, coopMultiplyAdd(y0_low, w1, x_01)));
+            x_02 = coopMultiplyAdd(y0, w2, coopMultiplyAdd(y0, w2_low, coopMultiplyAdd(y0_low, w2, x_02)));
+            x_03 = coopMultiplyAdd(y0, w3, coopMultiplyAdd(y0, w3_low, coopMultiplyAdd(y0_low, w3, x_03)));
+            x_10 = coopMultiplyAdd(y1, w0, coopMultiplyAdd(y1, w0_low, coopMultiplyAdd(y1_low, w0, x_10)));
+            x_11 = coopMultiplyAdd(y1, w1, coopMultiplyAdd(y1, w1_low, coopMultiplyAdd(y1_low, w1, x_11)));
+            x_12 = coopMultiplyAdd(y1, w2, coopMultiplyAdd(y1, w2_low, coopMultiplyAdd(y1_low, w2, x_12)));
+            x_13 = coopMultiplyAdd(y1, w3, coopMultiplyAdd(y1, w3_low, coopMultiplyAdd(y1_low, w3, x_13)));
         }
-        workgroupBarrier();
-        for (var k = 0u; k < 32u; k += SIDE) {
-            let ya = coopLoadT<Left>(&y_high[Y_STRIDE * row + k / 4u], Y_STRIDE);
-            let yb = coopLoadT<Left>(&y_high[Y_STRIDE * (row + SIDE) + k / 4u], Y_STRIDE);
-            let wa = coopLoadT<Right>(&w_high[W_STRIDE * k + in_ / 4u], W_STRIDE);
-            let wb = coopLoadT<Right>(&w_high[W_STRIDE * k + (in_ + SIDE) / 4u], W_STRIDE);
-            let ya_low = coopLoadT<Left>(&y_low[Y_STRIDE * row + k / 4u], Y_STRIDE);
-            let yb_low = coopLoadT<Left>(&y_low[Y_STRIDE * (row + SIDE) + k / 4u], Y_STRIDE);
-            let wa_low = coopLoadT<Right>(&w_low[W_STRIDE * k + in_ / 4u], W_STRIDE);
-            let wb_low = coopLoadT<Right>(&w_low[W_STRIDE * k + (in_ + SIDE) / 4u], W_STRIDE);
-            x_aa = coopMultiplyAdd(ya, wa, coopMultiplyAdd(ya, wa_low, coopMultiplyAdd(ya_low, wa, x_aa)));
-            x_ab = coopMultiplyAdd(ya, wb, coopMultiplyAdd(ya, wb_low, coopMultiplyAdd(ya_low, wb, x_ab)));
-            x_ba = coopMultiplyAdd(yb, wa, coopMultiplyAdd(yb, wa_low, coopMultiplyAdd(yb_low, wa, x_ba)));
-            x_bb = coopMultiplyAdd(yb, wb, coopMultiplyAdd(yb, wb_low, coopMultiplyAdd(yb_low, wb, x_bb)));
+        if (first >= n) {
+            break;
         }
     }
-    for (var part = 0u; part < 4u; part++) {
-        workgroupBarrier();
-        switch part {
-            case 0u: {
-                coopStoreT(x_aa, &sums[own], SIDE);
-            }
-            case 1u: {
-                coopStoreT(x_ab, &sums[own], SIDE);
-            }
-            case 2u: {
-                coopStoreT(x_ba, &sums[own], SIDE);
-            }
-            default: {
-                coopStoreT(x_bb, &sums[own], SIDE);
-            }
-        }
-        workgroupBarrier();
-        for (var i = 4u * lane; i < SIDE * SIDE; i += 4u * LANES) {
-            let r = row + SIDE * (part / 2u) + i / SIDE;
-            let column = in_ + SIDE * (part % 2u) + i % SIDE;
-            let scale = bitcast<f32>((254u - exponent(r)) << 23u) / W_SCALE;
-            let sum = vec4(sums[own + i], sums[own + i + 1u], sums[own + i + 2u], sums[own + i + 3u]);
-            put(group, first_row + r, first_in + column, scale * sum);
-        }
-    }
+    workgroupBarrier();
+    coopStoreT(x_00, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row, in_);
+    workgroupBarrier();
+    coopStoreT(x_01, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row, in_ + SIDE);
+    workgroupBarrier();
+    coopStoreT(x_02, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row, in_ + 2u * SIDE);
+    workgroupBarrier();
+    coopStoreT(x_03, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row, in_ + 3u * SIDE);
+    workgroupBarrier();
+    coopStoreT(x_10, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row + SIDE, in_);
+    workgroupBarrier();
+    coopStoreT(x_11, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row + SIDE, in_ + SIDE);
+    workgroupBarrier();
+    coopStoreT(x_12, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row + SIDE, in_ + 2u * SIDE);
+    workgroupBarrier();
+    coopStoreT(x_13, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row + SIDE, in_ + 3u * SIDE);
 }

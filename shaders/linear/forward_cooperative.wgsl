@@ -1,5 +1,5 @@
 // y[r, o] (+)= Σ_i W[o, i] x[r, i] + b[o], x and W as sums of two numbers in f16, weights at slots[first_group + r / rows_per_group] · weight_stride.
-// One invocation copies its part of 64 rows × 64 output features, 32 input features at a time; its subgroup multiplies 2 × 2 matrices of SIDE × SIDE of them.
+// One invocation copies its part of 64 rows × 128 output features, 16 input features at a time; its subgroup multiplies 2 × 4 matrices of SIDE × SIDE of them.
 // x [groups, rows_per_group, in], weights [.., out·in + out], slots [..] → y [groups, rows_per_group, out]; in and out multiples of 4.
 // ACCUMULATES y where accumulate is 1, else OVERWRITES it.
 
@@ -23,22 +23,20 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> y: array<vec4<f32>>;
 
-// Rows of x and rows of W, 32 features of each, in vectors of four; two vectors more, so that successive rows begin in different banks.
-const STRIDE: u32 = 10u;
-var<workgroup> x_high: array<vec4<f16>, 640>;
-var<workgroup> x_low: array<vec4<f16>, 640>;
-var<workgroup> w_high: array<vec4<f16>, 640>;
-var<workgroup> w_low: array<vec4<f16>, 640>;
+// Rows of x and rows of W, 16 features of each, in vectors of four; two vectors more, so that successive rows begin in different banks.
+const X_STRIDE: u32 = 6u;
+const W_STRIDE: u32 = 6u;
+var<workgroup> x_high: array<vec4<f16>, 384>;
+var<workgroup> x_low: array<vec4<f16>, 384>;
+var<workgroup> w_high: array<vec4<f16>, 768>;
+var<workgroup> w_low: array<vec4<f16>, 768>;
 // The largest value of each row of x, as the bits of a float, whose order is that of integers.
 var<workgroup> largest: array<atomic<u32>, 64>;
 // A matrix of sums for each subgroup.
-var<workgroup> sums: array<f32, 1024>;
+var<workgroup> sums: array<vec4<f32>, 256>;
 
-// Each subgroup has 2 × 2 matrices of the 64 × 64 results.
+// Each subgroup has 2 × 4 matrices of the 64 × 128 results.
 const INVOCATIONS: u32 = 1024u / (SIDE * SIDE) * LANES;
-
-// How many invocations look for the largest value of a row.
-const SHARES: u32 = max(INVOCATIONS / 64u, 1u);
 
 // Where the weights of a group begin, in elements.
 fn weights_of(group: u32) -> u32 {
@@ -61,16 +59,40 @@ fn high(values: vec4<f32>) -> vec4<f32> {
     return bitcast<vec4<f32>>(bitcast<vec4<u32>>(values) & vec4(0xffffe000u));
 }
 
-fn put(group: u32, row: u32, out: u32, sum: vec4<f32>, bias: u32) {
+fn most(values: vec4<f32>) -> f32 {
+    return max(max(values.x, values.y), max(values.z, values.w));
+}
+
+fn keep_x(at: u32, values: vec4<f32>) {
+    x_high[at] = vec4<f16>(high(values));
+    x_low[at] = vec4<f16>(values - high(values));
+}
+
+fn keep_w(at: u32, values: vec4<f32>) {
+    w_high[at] = vec4<f16>(high(values));
+    w_low[at] = vec4<f16>(values - high(values));
+}
+
+fn put(group: u32, row: u32, out: u32, sum: vec4<f32>) {
     if (row >= params.rows_per_group || out >= params.out_features) {
         return;
     }
     let at = ((group * params.rows_per_group + row) * params.out_features + out) / 4u;
-    var value = sum + weights[bias + out / 4u];
+    let bias = (weights_of(group) + params.out_features * params.in_features + out) / 4u;
+    var value = sum + weights[bias];
     if (params.accumulate == 1u) {
         value += y[at];
     }
     y[at] = value;
+}
+
+// From the subgroup's matrix of sums; its row and feature within the tile.
+fn put_matrix(workgroup: vec3<u32>, own: u32, lane: u32, row: u32, out: u32) {
+    for (var i = lane; i < SIDE * SIDE / 4u; i += LANES) {
+        let r = row + i / (SIDE / 4u);
+        let scale = bitcast<f32>((254u - exponent(r)) << 23u) / W_SCALE;
+        put(workgroup.z, 64u * workgroup.x + r, 128u * workgroup.y + out + 4u * (i % (SIDE / 4u)), scale * sums[own + i]);
+    }
 }
 
 @compute @workgroup_size(INVOCATIONS)
@@ -81,100 +103,143 @@ fn main(
     @builtin(subgroup_invocation_id) lane: u32,
 ) {
     let first_row = 64u * workgroup.x;
-    let first_out = 64u * workgroup.y;
-    let group = workgroup.z;
+    let first_out = 128u * workgroup.y;
     let n = params.in_features / 4u;
     // The last row stands in for those beyond it, of x and of W.
-    let x_first = group * params.rows_per_group * n;
+    let x_first = workgroup.z * params.rows_per_group * n;
     let last_row = params.rows_per_group - 1u;
-    let w_first = weights_of(group) / 4u;
+    let w_first = weights_of(workgroup.z) / 4u;
     let last_out = params.out_features - 1u;
+    let own = SIDE * SIDE / 4u * subgroup;
 
-    for (var i = index; i < 64u; i += INVOCATIONS) {
-        atomicStore(&largest[i], 0u);
+    if (index < 64u) {
+        atomicStore(&largest[index], 0u);
     }
-    for (var i = index; i < 1024u; i += INVOCATIONS) {
-        sums[i] = 0.0;
-    }
+    sums[index] = vec4(0.0);
+    sums[index + 128u] = vec4(0.0);
     workgroupBarrier();
-    for (var r = index / SHARES; r < 64u; r += INVOCATIONS / SHARES) {
-        let at = x_first + min(first_row + r, last_row) * n;
-        var most = vec4(0.0);
-        // Eight at once, which a GPU waits for together.
-        for (var i = index % SHARES; i < n; i += 8u * SHARES) {
-            let a = max(abs(x[at + min(i + 0u * SHARES, n - 1u)]), abs(x[at + min(i + 1u * SHARES, n - 1u)]));
-            let b = max(abs(x[at + min(i + 2u * SHARES, n - 1u)]), abs(x[at + min(i + 3u * SHARES, n - 1u)]));
-            let c = max(abs(x[at + min(i + 4u * SHARES, n - 1u)]), abs(x[at + min(i + 5u * SHARES, n - 1u)]));
-            let d = max(abs(x[at + min(i + 6u * SHARES, n - 1u)]), abs(x[at + min(i + 7u * SHARES, n - 1u)]));
-            most = max(most, max(max(a, b), max(c, d)));
+    {
+        // Two invocations look for the largest value of a row; eight vectors at once, which a GPU waits for together.
+        let at = x_first + min(first_row + index / 2u, last_row) * n;
+        var values = vec4(0.0);
+        for (var i = index % 2u; i < n; i += 16u) {
+            let a = max(abs(x[at + min(i + 0u, n - 1u)]), abs(x[at + min(i + 2u, n - 1u)]));
+            let b = max(abs(x[at + min(i + 4u, n - 1u)]), abs(x[at + min(i + 6u, n - 1u)]));
+            let c = max(abs(x[at + min(i + 8u, n - 1u)]), abs(x[at + min(i + 10u, n - 1u)]));
+            let d = max(abs(x[at + min(i + 12u, n - 1u)]), abs(x[at + min(i + 14u, n - 1u)]));
+            values = max(values, max(max(a, b), max(c, d)));
         }
-        atomicMax(&largest[r], bitcast<u32>(max(max(most.x, most.y), max(most.z, most.w))));
+        atomicMax(&largest[index / 2u], bitcast<u32>(most(values)));
     }
     workgroupBarrier();
 
     let row = 2u * SIDE * (subgroup / (32u / SIDE));
-    let out = 2u * SIDE * (subgroup % (32u / SIDE));
-    let own = SIDE * SIDE * subgroup;
-    var y_aa = coopLoadT<Sums>(&sums[own], SIDE);
-    var y_ab = y_aa;
-    var y_ba = y_aa;
-    var y_bb = y_aa;
-    for (var first = 0u; first < n; first += 8u) {
+    let out = 4u * SIDE * (subgroup % (32u / SIDE));
+    var y_00 = coopLoadT<Sums>(&sums[own], SIDE / 4u);
+    var y_01 = y_00;
+    var y_02 = y_00;
+    var y_03 = y_00;
+    var y_10 = y_00;
+    var y_11 = y_00;
+    var y_12 = y_00;
+    var y_13 = y_00;
+
+    // What this invocation copies: a vector of each of two rows of x and of four of W.
+    let r = index / 4u;
+    let feature = index % 4u;
+    let to = X_STRIDE * r + feature;
+    let x_a = x_first + min(first_row + r, last_row) * n;
+    let x_b = x_first + min(first_row + r + 32u, last_row) * n;
+    let w_a = w_first + min(first_out + r, last_out) * n;
+    let w_b = w_first + min(first_out + r + 32u, last_out) * n;
+    let w_c = w_first + min(first_out + r + 64u, last_out) * n;
+    let w_d = w_first + min(first_out + r + 96u, last_out) * n;
+    let scale_a = bitcast<f32>(exponent(r) << 23u);
+    let scale_b = bitcast<f32>(exponent(r + 32u) << 23u);
+    var first = 0u;
+    var i = min(feature, n - 1u);
+    var xa = x[x_a + i];
+    var xb = x[x_b + i];
+    var wa = weights[w_a + i];
+    var wb = weights[w_b + i];
+    var wc = weights[w_c + i];
+    var wd = weights[w_d + i];
+    loop {
+        // Nothing beyond the last feature.
+        let within = select(0.0, 1.0, first + feature < n);
         workgroupBarrier();
-        for (var i = index; i < 512u; i += INVOCATIONS) {
-            let r = i / 8u;
-            let k = first + i % 8u;
-            let at = min(k, n - 1u);
-            // Nothing beyond the last feature.
-            let scale = select(0.0, bitcast<f32>(exponent(r) << 23u), k < n);
-            let xs = scale * x[x_first + min(first_row + r, last_row) * n + at];
-            let ws = W_SCALE * weights[w_first + min(first_out + r, last_out) * n + at];
-            let to = STRIDE * r + i % 8u;
-            x_high[to] = vec4<f16>(high(xs));
-            x_low[to] = vec4<f16>(xs - high(xs));
-            w_high[to] = vec4<f16>(high(ws));
-            w_low[to] = vec4<f16>(ws - high(ws));
+        keep_x(to, within * scale_a * xa);
+        keep_x(to + 32u * X_STRIDE, within * scale_b * xb);
+        keep_w(to, W_SCALE * wa);
+        keep_w(to + 32u * W_STRIDE, W_SCALE * wb);
+        keep_w(to + 64u * W_STRIDE, W_SCALE * wc);
+        keep_w(to + 96u * W_STRIDE, W_SCALE * wd);
+        workgroupBarrier();
+        // The next ones are on their way while these are multiplied.
+        first += 4u;
+        i = min(first + feature, n - 1u);
+        xa = x[x_a + i];
+        xb = x[x_b + i];
+        wa = weights[w_a + i];
+        wb = weights[w_b + i];
+        wc = weights[w_c + i];
+        wd = weights[w_d + i];
+        for (var k = 0u; k < 16u; k += SIDE) {
+            let x0 = coopLoadT<Left>(&x_high[X_STRIDE * row + k / 4u], X_STRIDE);
+            let x0_low = coopLoadT<Left>(&x_low[X_STRIDE * row + k / 4u], X_STRIDE);
+            let x1 = coopLoadT<Left>(&x_high[X_STRIDE * (row + SIDE) + k / 4u], X_STRIDE);
+            let x1_low = coopLoadT<Left>(&x_low[X_STRIDE * (row + SIDE) + k / 4u], X_STRIDE);
+            let w0 = coopLoad<Right>(&w_high[W_STRIDE * out + k / 4u], W_STRIDE);
+            let w0_low = coopLoad<Right>(&w_low[W_STRIDE * out + k / 4u], W_STRIDE);
+            let w1 = coopLoad<Right>(&w_high[W_STRIDE * (out + SIDE) + k / 4u], W_STRIDE);
+            let w1_low = coopLoad<Right>(&w_low[W_STRIDE * (out + SIDE) + k / 4u], W_STRIDE);
+            let w2 = coopLoad<Right>(&w_high[W_STRIDE * (out + 2u * SIDE) + k / 4u], W_STRIDE);
+            let w2_low = coopLoad<Right>(&w_low[W_STRIDE * (out + 2u * SIDE) + k / 4u], W_STRIDE);
+            let w3 = coopLoad<Right>(&w_high[W_STRIDE * (out + 3u * SIDE) + k / 4u], W_STRIDE);
+            let w3_low = coopLoad<Right>(&w_low[W_STRIDE * (out + 3u * SIDE) + k / 4u], W_STRIDE);
+            y_00 = coopMultiplyAdd(x0, w0, coopMultiplyAdd(x0, w0_low, coopMultiplyAdd(x0_low, w0, y_00)));
+            y_01 = coopMultiplyAdd(x0, w1, coopMultiplyAdd(x0, w1_low, coopMultiplyAdd(x0_low, w1, y_01)));
+            y_02 = coopMultiplyAdd(x0, w2, coopMultiplyAdd(x0, w2_low, coopMultiplyAdd(x0_low, w2, y_02)));
+            y_03 = coopMultiplyAdd(x0, w3, coopMultiplyAdd(x0, w3_low, coopMultiplyAdd(x0_low, w3, y_03)));
+            y_10 = coopMultiplyAdd(x1, w0, coopMultiplyAdd(x1, w0_low, coopMultiplyAdd(x1_low, w0, y_10)));
+            y_11 = coopMultiplyAdd(x1, w1, coopMultiplyAdd(x1, w1_low, coopMultiplyAdd(x1_low, w1, y_11)));
+            y_12 = coopMultiplyAdd(x1, w2, coopMultiplyAdd(x1, w2_low, coopMultiplyAdd(x1_low, w2, y_12)));
+            y_13 = coopMultiplyAdd(x1, w3, coopMultiplyAdd(x1, w3_low, coopMultiplyAdd(x1_low, w3, y_13)));
         }
-        workgroupBarrier();
-        for (var k = 0u; k < 32u; k += SIDE) {
-            let xa = coopLoadT<Left>(&x_high[STRIDE * row + k / 4u], STRIDE);
-            let xb = coopLoadT<Left>(&x_high[STRIDE * (row + SIDE) + k / 4u], STRIDE);
-            let wa = coopLoad<Right>(&w_high[STRIDE * out + k / 4u], STRIDE);
-            let wb = coopLoad<Right>(&w_high[STRIDE * (out + SIDE) + k / 4u], STRIDE);
-            let xa_low = coopLoadT<Left>(&x_low[STRIDE * row + k / 4u], STRIDE);
-            let xb_low = coopLoadT<Left>(&x_low[STRIDE * (row + SIDE) + k / 4u], STRIDE);
-            let wa_low = coopLoad<Right>(&w_low[STRIDE * out + k / 4u], STRIDE);
-            let wb_low = coopLoad<Right>(&w_low[STRIDE * (out + SIDE) + k / 4u], STRIDE);
-            y_aa = coopMultiplyAdd(xa, wa, coopMultiplyAdd(xa, wa_low, coopMultiplyAdd(xa_low, wa, y_aa)));
-            y_ab = coopMultiplyAdd(xa, wb, coopMultiplyAdd(xa, wb_low, coopMultiplyAdd(xa_low, wb, y_ab)));
-            y_ba = coopMultiplyAdd(xb, wa, coopMultiplyAdd(xb, wa_low, coopMultiplyAdd(xb_low, wa, y_ba)));
-            y_bb = coopMultiplyAdd(xb, wb, coopMultiplyAdd(xb, wb_low, coopMultiplyAdd(xb_low, wb, y_bb)));
+        if (first >= n) {
+            break;
         }
     }
-    let bias = w_first + params.out_features * n;
-    for (var part = 0u; part < 4u; part++) {
-        workgroupBarrier();
-        switch part {
-            case 0u: {
-                coopStoreT(y_aa, &sums[own], SIDE);
-            }
-            case 1u: {
-                coopStoreT(y_ab, &sums[own], SIDE);
-            }
-            case 2u: {
-                coopStoreT(y_ba, &sums[own], SIDE);
-            }
-            default: {
-                coopStoreT(y_bb, &sums[own], SIDE);
-            }
-        }
-        workgroupBarrier();
-        for (var i = 4u * lane; i < SIDE * SIDE; i += 4u * LANES) {
-            let r = row + SIDE * (part / 2u) + i / SIDE;
-            let o = out + SIDE * (part % 2u) + i % SIDE;
-            let scale = bitcast<f32>((254u - exponent(r)) << 23u) / W_SCALE;
-            let sum = vec4(sums[own + i], sums[own + i + 1u], sums[own + i + 2u], sums[own + i + 3u]);
-            put(group, first_row + r, first_out + o, scale * sum, bias);
-        }
-    }
+    workgroupBarrier();
+    coopStoreT(y_00, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row, out);
+    workgroupBarrier();
+    coopStoreT(y_01, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row, out + SIDE);
+    workgroupBarrier();
+    coopStoreT(y_02, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row, out + 2u * SIDE);
+    workgroupBarrier();
+    coopStoreT(y_03, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row, out + 3u * SIDE);
+    workgroupBarrier();
+    coopStoreT(y_10, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row + SIDE, out);
+    workgroupBarrier();
+    coopStoreT(y_11, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row + SIDE, out + SIDE);
+    workgroupBarrier();
+    coopStoreT(y_12, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row + SIDE, out + 2u * SIDE);
+    workgroupBarrier();
+    coopStoreT(y_13, &sums[own], SIDE / 4u);
+    workgroupBarrier();
+    put_matrix(workgroup, own, lane, row + SIDE, out + 3u * SIDE);
 }

@@ -45,6 +45,8 @@ pub enum Requirement {
     FeaturesMultipleOf4,
     /// None of those parameters exceeds 256.
     FeaturesAtMost256,
+    /// None of those parameters exceeds 1024.
+    FeaturesAtMost1024,
     /// The device has subgroups, always of at least eight lanes.
     Subgroups,
     /// Subgroups of the device, all of one size, multiply matrices of `f16` with sums in `f32`. [`Cooperative::head`] stands before the text.
@@ -61,7 +63,7 @@ pub struct Cooperative {
 }
 
 impl Cooperative {
-    /// Invocations of a workgroup, whose subgroups share 64 × 64 results, each with 2 × 2 matrices.
+    /// Invocations of a workgroup, whose subgroups share 64 × 128 results, each with 2 × 4 matrices: the texts take 128.
     pub fn invocations(self) -> u32 {
         1024 / (self.side * self.side) * self.lanes
     }

@@ -109,14 +109,14 @@ table! {
         or "forward_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
         or "forward_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
         or "forward_subgroup" tile [128, 64, 1], when [FeaturesMultipleOf4, Subgroups],
-        or "forward_cooperative" tile [64, 64, 1], when [FeaturesMultipleOf4, CooperativeMatrices];
+        or "forward_cooperative" tile [64, 128, 1], when [FeaturesMultipleOf4, FeaturesAtMost1024, CooperativeMatrices];
     /// `d_x[r,i] (+)= Σ_{o=first_out}^{end_out-1} W[o,i] d_y[r,o]`. Extent: rows of a group × in_features × groups.
     LINEAR_BACKWARD_INPUT = "linear"/"backward_input", LinearParams, tile [64, 32, 1],
         (d_y: f32, weights: f32, slots: u32) -> (d_x: f32),
         or "backward_input_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
         or "backward_input_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
         or "backward_input_subgroup" tile [128, 64, 1], when [FeaturesMultipleOf4, Subgroups],
-        or "backward_input_cooperative" tile [64, 64, 1], when [FeaturesMultipleOf4, CooperativeMatrices];
+        or "backward_input_cooperative" tile [64, 128, 1], when [FeaturesMultipleOf4, FeaturesAtMost1024, CooperativeMatrices];
     /// `partial[g,c] (+)= (Σ_r d_y[r,o] x[r,i], Σ_r d_y[r,o])` over the rows of chunk `c`: weight, then bias; `[groups, chunks, out·in + out]`.
     /// Extent: out_features × in_features × (groups · chunks). (Independent of `slots`: group `g` writes set `g`.)
     LINEAR_BACKWARD_WEIGHT = "linear"/"backward_weight", LinearParams, tile [32, 32, 1],

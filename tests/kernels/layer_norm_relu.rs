@@ -33,8 +33,8 @@ pub static FORWARD: KernelTest = KernelTest {
 
 pub static BACKWARD_INPUT: KernelTest = KernelTest {
     kernel: &LAYER_NORM_RELU_BACKWARD_INPUT,
-    // Worst 1.4e-7 on llvmpipe.
-    tolerance: 7e-7,
+    // Worst 1.4e-7 on llvmpipe, 1.7e-6 on an H100, whose quotients are rounded twice: of three features whose gradients nearly cancel.
+    tolerance: 4e-6,
     cases,
     faults: &[
         ("backward_input", "- mean_e", "+ mean_e"),

@@ -59,7 +59,7 @@ fn a_pose_is_found_by_cooperative_matrices() {
 fn wrong_products_are_not_used() {
     let Some(gpu) = cooperative_gpu() else { return };
     let faulty = cooperative(&gpu.with_sources(|kernel, variant| {
-        kernel.source(variant).replace("x_ba = coopMultiplyAdd(yb", "x_ba = coopMultiplyAdd(ya")
+        kernel.source(variant).replace("x_12 = coopMultiplyAdd(y1", "x_12 = coopMultiplyAdd(y0")
     }));
     let with_fault = found(&faulty);
     let difference = faulty.cooperative_difference().expect("checked by now");

@@ -138,6 +138,7 @@ fn is_usable(variant: &Variant, step: &Step, gpu: &Gpu) -> bool {
     variant.requires.iter().all(|requirement| match requirement {
         Requirement::FeaturesMultipleOf4 => widths(step).all(|width| width % 4 == 0),
         Requirement::FeaturesAtMost256 => widths(step).all(|width| width <= 256),
+        Requirement::FeaturesAtMost1024 => widths(step).all(|width| width <= 1024),
         Requirement::Subgroups => gpu.has_subgroups(),
         Requirement::CooperativeMatrices => gpu.cooperative().is_some(),
     })

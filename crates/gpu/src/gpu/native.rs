@@ -86,8 +86,8 @@ fn find_cooperative(adapter: &wgpu::Adapter) -> Option<Cooperative> {
     let sides = properties.filter(|p| (p.ab_type, p.cr_type) == (F16, F32) && p.m_size == p.n_size && p.n_size == p.k_size);
     let side = sides.map(|p| p.m_size).max().filter(|_| is_whole)?;
     let cooperative = Cooperative { side, lanes: info.subgroup_min_size };
-    let is_supported = cooperative.invocations() <= wgpu::Limits::default().max_compute_invocations_per_workgroup
-        && adapter.limits().max_compute_workgroup_storage_size >= COOPERATIVE_STORAGE;
+    let is_supported =
+        cooperative.invocations() == 128 && adapter.limits().max_compute_workgroup_storage_size >= COOPERATIVE_STORAGE;
     is_supported.then_some(cooperative)
 }
 
