@@ -1,6 +1,6 @@
-// d_x[r, i] (+)= Σ_o W[o, i] d_y[r, o] for o in first_out .. end_out, weights at slots[first_group + r / rows_per_group] · weight_stride.
+// d_x[g, c, r, i] (+)= Σ_o W[o, i] d_y[g, r, o] over the output features o of chunk c, weights at slots[first_group + r / rows_per_group] · weight_stride.
 // One invocation computes 8 rows × 4 input features in registers, one output feature at a time.
-// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, rows_per_group, in].
+// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, chunks, rows_per_group, in].
 // ACCUMULATES d_x where accumulate is 1, else OVERWRITES it.
 
 struct Params {
@@ -11,8 +11,7 @@ struct Params {
     out_features: u32,
     weight_stride: u32,
     accumulate: u32,
-    first_out: u32,
-    end_out: u32,
+    chunk_outs: u32,
     chunk_rows: u32,
     chunks: u32,
 }
@@ -31,11 +30,11 @@ fn weights_of(group: u32) -> u32 {
     return slots[params.first_group + group] * params.weight_stride;
 }
 
-fn store(group: u32, row: u32, in_: u32, values: vec4<f32>) {
+fn store(part: u32, row: u32, in_: u32, values: vec4<f32>) {
     if (row >= params.rows_per_group) {
         return;
     }
-    let first = (group * params.rows_per_group + row) * params.in_features + in_;
+    let first = (part * params.rows_per_group + row) * params.in_features + in_;
     for (var i = 0u; i < min(params.in_features - in_, 4u); i++) {
         var value = values[i];
         if (params.accumulate == 1u) {
@@ -50,7 +49,10 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let tile_at = tile_index(workgroup, local, vec2(params.rows_per_group, params.in_features));
     let row = 8u * tile_at.x;
     let in_ = 4u * tile_at.y;
-    let group = workgroup.z;
+    let part = workgroup.z;
+    let group = part / params.chunks;
+    let begin = part % params.chunks * params.chunk_outs;
+    let end = min(begin + params.chunk_outs, params.out_features);
     if (row >= params.rows_per_group || in_ >= params.in_features || group >= params.groups) {
         return;
     }
@@ -71,7 +73,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     var x5: vec4<f32>;
     var x6: vec4<f32>;
     var x7: vec4<f32>;
-    for (var o = params.first_out; o < params.end_out; o++) {
+    for (var o = begin; o < end; o++) {
         let at = column + o * params.in_features;
         let w = vec4(weights[at.x], weights[at.y], weights[at.z], weights[at.w]);
         x0 += w * d_y[y_a.x + o];
@@ -83,12 +85,12 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         x6 += w * d_y[y_b.z + o];
         x7 += w * d_y[y_b.w + o];
     }
-    store(group, row, in_, x0);
-    store(group, row + 1u, in_, x1);
-    store(group, row + 2u, in_, x2);
-    store(group, row + 3u, in_, x3);
-    store(group, row + 4u, in_, x4);
-    store(group, row + 5u, in_, x5);
-    store(group, row + 6u, in_, x6);
-    store(group, row + 7u, in_, x7);
+    store(part, row, in_, x0);
+    store(part, row + 1u, in_, x1);
+    store(part, row + 2u, in_, x2);
+    store(part, row + 3u, in_, x3);
+    store(part, row + 4u, in_, x4);
+    store(part, row + 5u, in_, x5);
+    store(part, row + 6u, in_, x6);
+    store(part, row + 7u, in_, x7);
 }

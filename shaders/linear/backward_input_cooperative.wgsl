@@ -1,4 +1,4 @@
-// d_x[r, i] (+)= Σ_o W[o, i] d_y[r, o] for all o, which are no more than one step may sum, d_y and W as sums of two numbers in f16, weights at slots[first_group + r / rows_per_group] · weight_stride.
+// d_x[r, i] (+)= Σ_o W[o, i] d_y[r, o] for all o, of which there is one chunk, d_y and W as sums of two numbers in f16, weights at slots[first_group + r / rows_per_group] · weight_stride.
 // One invocation copies its part of 64 rows × 128 input features, 16 output features at a time; its subgroup multiplies 2 × 4 matrices of SIDE × SIDE of them.
 // d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, rows_per_group, in]; in and out multiples of 4.
 // ACCUMULATES d_x where accumulate is 1, else OVERWRITES it.
@@ -11,8 +11,7 @@ struct Params {
     out_features: u32,
     weight_stride: u32,
     accumulate: u32,
-    first_out: u32,
-    end_out: u32,
+    chunk_outs: u32,
     chunk_rows: u32,
     chunks: u32,
 }

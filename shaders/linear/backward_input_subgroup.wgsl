@@ -1,6 +1,6 @@
-// d_x[r, i] (+)= Σ_o W[o, i] d_y[r, o] for o in first_out .. end_out, weights at slots[first_group + r / rows_per_group] · weight_stride.
+// d_x[g, c, r, i] (+)= Σ_o W[o, i] d_y[g, r, o] over the output features o of chunk c, weights at slots[first_group + r / rows_per_group] · weight_stride.
 // One invocation computes 32 rows × 8 input features in registers; it loads every eighth of the rows and gets the others from seven lanes beside it.
-// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, rows_per_group, in]; in, out and both ends multiples of 4.
+// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, chunks, rows_per_group, in]; in, out and chunk_outs multiples of 4.
 // ACCUMULATES d_x where accumulate is 1, else OVERWRITES it.
 
 struct Params {
@@ -11,8 +11,7 @@ struct Params {
     out_features: u32,
     weight_stride: u32,
     accumulate: u32,
-    first_out: u32,
-    end_out: u32,
+    chunk_outs: u32,
     chunk_rows: u32,
     chunks: u32,
 }
@@ -60,11 +59,11 @@ fn w_columns(at: u32, stride: u32) -> mat4x4<f32> {
     return mat4x4(weights[at], weights[at + stride], weights[at + 2u * stride], weights[at + 3u * stride]);
 }
 
-fn put(group: u32, row: u32, in_: u32, sum: vec4<f32>) {
+fn put(part: u32, row: u32, in_: u32, sum: vec4<f32>) {
     if (row >= params.rows_per_group || in_ >= params.in_features) {
         return;
     }
-    let at = ((group * params.rows_per_group + row) * params.in_features + in_) / 4u;
+    let at = ((part * params.rows_per_group + row) * params.in_features + in_) / 4u;
     var value = sum;
     if (params.accumulate == 1u) {
         value += d_x[at];
@@ -72,15 +71,15 @@ fn put(group: u32, row: u32, in_: u32, sum: vec4<f32>) {
     d_x[at] = value;
 }
 
-fn store(group: u32, row: u32, in_: u32, sum: Eight) {
-    put(group, row, in_, sum.r0);
-    put(group, row + 1u, in_, sum.r1);
-    put(group, row + 2u, in_, sum.r2);
-    put(group, row + 3u, in_, sum.r3);
-    put(group, row + 4u, in_, sum.r4);
-    put(group, row + 5u, in_, sum.r5);
-    put(group, row + 6u, in_, sum.r6);
-    put(group, row + 7u, in_, sum.r7);
+fn store(part: u32, row: u32, in_: u32, sum: Eight) {
+    put(part, row, in_, sum.r0);
+    put(part, row + 1u, in_, sum.r1);
+    put(part, row + 2u, in_, sum.r2);
+    put(part, row + 3u, in_, sum.r3);
+    put(part, row + 4u, in_, sum.r4);
+    put(part, row + 5u, in_, sum.r5);
+    put(part, row + 6u, in_, sum.r6);
+    put(part, row + 7u, in_, sum.r7);
 }
 
 @compute @workgroup_size(32)
@@ -97,7 +96,10 @@ fn main(
     let row = 128u * workgroup.x + 32u * team;
     let in_a = 64u * workgroup.y + 8u * member;
     let in_b = in_a + 4u;
-    let group = workgroup.z;
+    let part = workgroup.z;
+    let group = part / params.chunks;
+    let begin = part % params.chunks * params.chunk_outs;
+    let end = min(begin + params.chunk_outs, params.out_features);
     if (row >= params.rows_per_group) {
         return;
     }
@@ -117,7 +119,7 @@ fn main(
     var x_1b: Eight;
     var x_2b: Eight;
     var x_3b: Eight;
-    for (var o = params.first_out / 4u; o < params.end_out / 4u; o++) {
+    for (var o = begin / 4u; o < end / 4u; o++) {
         let wa = w_columns(w_a + 4u * o * stride, stride);
         let y0 = d_y[y_row.x + o];
         multiply_add(&x_0a, wa, y0, first);
@@ -133,12 +135,12 @@ fn main(
         multiply_add(&x_2b, wb, y2, first);
         multiply_add(&x_3b, wb, y3, first);
     }
-    store(group, row, in_a, x_0a);
-    store(group, row + 8u, in_a, x_1a);
-    store(group, row + 16u, in_a, x_2a);
-    store(group, row + 24u, in_a, x_3a);
-    store(group, row, in_b, x_0b);
-    store(group, row + 8u, in_b, x_1b);
-    store(group, row + 16u, in_b, x_2b);
-    store(group, row + 24u, in_b, x_3b);
+    store(part, row, in_a, x_0a);
+    store(part, row + 8u, in_a, x_1a);
+    store(part, row + 16u, in_a, x_2a);
+    store(part, row + 24u, in_a, x_3a);
+    store(part, row, in_b, x_0b);
+    store(part, row + 8u, in_b, x_1b);
+    store(part, row + 16u, in_b, x_2b);
+    store(part, row + 24u, in_b, x_3b);
 }

@@ -1,6 +1,6 @@
-// d_x[r, i] (+)= Σ_o W[o, i] d_y[r, o] for o in first_out .. end_out, weights at slots[first_group + r / rows_per_group] · weight_stride.
+// d_x[g, c, r, i] (+)= Σ_o W[o, i] d_y[g, r, o] over the output features o of chunk c, weights at slots[first_group + r / rows_per_group] · weight_stride.
 // One invocation computes 8 rows × 8 input features in registers, four output features at a time.
-// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, rows_per_group, in]; in, out and both ends multiples of 4.
+// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, chunks, rows_per_group, in]; in, out and chunk_outs multiples of 4.
 // ACCUMULATES d_x where accumulate is 1, else OVERWRITES it.
 
 struct Params {
@@ -11,8 +11,7 @@ struct Params {
     out_features: u32,
     weight_stride: u32,
     accumulate: u32,
-    first_out: u32,
-    end_out: u32,
+    chunk_outs: u32,
     chunk_rows: u32,
     chunks: u32,
 }
@@ -42,12 +41,12 @@ fn w_columns(at: u32, stride: u32) -> mat4x4<f32> {
 }
 
 // Columns are rows of d_x.
-fn store(group: u32, row: u32, in_: u32, tile: mat4x4<f32>) {
+fn store(part: u32, row: u32, in_: u32, tile: mat4x4<f32>) {
     if (in_ >= params.in_features) {
         return;
     }
     let stride = params.in_features / 4u;
-    let at = (group * params.rows_per_group + row) * stride + in_ / 4u;
+    let at = (part * params.rows_per_group + row) * stride + in_ / 4u;
     let count = min(params.rows_per_group - min(row, params.rows_per_group), 4u);
     var columns = tile;
     for (var r = 0u; r < count; r++) {
@@ -64,7 +63,10 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let tile_at = 8u * tile_index(workgroup, local, vec2(params.rows_per_group, params.in_features));
     let row = tile_at.x;
     let in_ = tile_at.y;
-    let group = workgroup.z;
+    let part = workgroup.z;
+    let group = part / params.chunks;
+    let begin = part % params.chunks * params.chunk_outs;
+    let end = min(begin + params.chunk_outs, params.out_features);
     if (row >= params.rows_per_group || in_ >= params.in_features || group >= params.groups) {
         return;
     }
@@ -84,7 +86,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     var x_ab: mat4x4<f32>;
     var x_ba: mat4x4<f32>;
     var x_bb: mat4x4<f32>;
-    for (var o = params.first_out / 4u; o < params.end_out / 4u; o++) {
+    for (var o = begin / 4u; o < end / 4u; o++) {
         let ya = d_y_columns(y_a, o);
         let yb = d_y_columns(y_b, o);
         let wa = w_columns(w_a + 4u * o * stride, stride);
@@ -94,8 +96,8 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         x_ba += wa * yb;
         x_bb += wb * yb;
     }
-    store(group, row, in_, x_aa);
-    store(group, row, in_ + 4u, x_ab);
-    store(group, row + 4u, in_, x_ba);
-    store(group, row + 4u, in_ + 4u, x_bb);
+    store(part, row, in_, x_aa);
+    store(part, row, in_ + 4u, x_ab);
+    store(part, row + 4u, in_, x_ba);
+    store(part, row + 4u, in_ + 4u, x_bb);
 }

@@ -1,6 +1,6 @@
-// d_x[r, i] (+)= Σ_o W[o, i] d_y[r, o] for o in first_out .. end_out, weights at slots[first_group + r / rows_per_group] · weight_stride.
+// d_x[g, c, r, i] (+)= Σ_o W[o, i] d_y[g, r, o] over the output features o of chunk c, weights at slots[first_group + r / rows_per_group] · weight_stride.
 // One invocation computes 8 rows × 8 input features in registers; a workgroup of 64 × 64 reads what it needs of d_y and W once, 16 output features at a time.
-// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, rows_per_group, in]; in, out and both ends multiples of 4.
+// d_y [groups, rows_per_group, out], weights [.., out·in + out], slots [..] → d_x [groups, chunks, rows_per_group, in]; in, out and chunk_outs multiples of 4.
 // ACCUMULATES d_x where accumulate is 1, else OVERWRITES it.
 
 struct Params {
@@ -11,8 +11,7 @@ struct Params {
     out_features: u32,
     weight_stride: u32,
     accumulate: u32,
-    first_out: u32,
-    end_out: u32,
+    chunk_outs: u32,
     chunk_rows: u32,
     chunks: u32,
 }
@@ -62,11 +61,11 @@ fn multiply_add(sums: ptr<function, Sums>, local: vec3<u32>, k: u32) {
     (*sums).bb += outer(yb, wb);
 }
 
-fn put(group: u32, row: u32, in_: u32, sum: vec4<f32>) {
+fn put(part: u32, row: u32, in_: u32, sum: vec4<f32>) {
     if (row >= params.rows_per_group || in_ >= params.in_features) {
         return;
     }
-    let at = ((group * params.rows_per_group + row) * params.in_features + in_) / 4u;
+    let at = ((part * params.rows_per_group + row) * params.in_features + in_) / 4u;
     var value = sum;
     if (params.accumulate == 1u) {
         value += d_x[at];
@@ -75,11 +74,11 @@ fn put(group: u32, row: u32, in_: u32, sum: vec4<f32>) {
 }
 
 // Columns are rows of d_x.
-fn store(group: u32, row: u32, in_: u32, tile: mat4x4<f32>) {
-    put(group, row, in_, tile[0]);
-    put(group, row + 1u, in_, tile[1]);
-    put(group, row + 2u, in_, tile[2]);
-    put(group, row + 3u, in_, tile[3]);
+fn store(part: u32, row: u32, in_: u32, tile: mat4x4<f32>) {
+    put(part, row, in_, tile[0]);
+    put(part, row + 1u, in_, tile[1]);
+    put(part, row + 2u, in_, tile[2]);
+    put(part, row + 3u, in_, tile[3]);
 }
 
 @compute @workgroup_size(8, 8)
@@ -90,7 +89,10 @@ fn main(
 ) {
     let first_row = 64u * workgroup.x;
     let first_in = 64u * workgroup.y;
-    let group = workgroup.z;
+    let part = workgroup.z;
+    let group = part / params.chunks;
+    let begin = part % params.chunks * params.chunk_outs;
+    let end = min(begin + params.chunk_outs, params.out_features);
     // What this invocation copies: four output features of four rows of d_y, and four rows of W, four input features of each. The
     // last ones stand in for those beyond them.
     let n = params.out_features / 4u;
@@ -101,12 +103,12 @@ fn main(
     let w_to = 64u * (index / 16u) + index % 16u;
 
     var sums: Sums;
-    let end = params.end_out / 4u;
-    for (var first = params.first_out / 4u; first < end; first += 4u) {
+    let last = end / 4u - 1u;
+    for (var first = begin / 4u; first <= last; first += 4u) {
         // Nothing beyond the last feature.
-        let within = select(0.0, 1.0, first + index % 4u < end);
-        let y_at = y_row * n + min(first + index % 4u, end - 1u);
-        let w_at = w_column + 4u * min(first + index / 16u, end - 1u) * stride;
+        let within = select(0.0, 1.0, first + index % 4u <= last);
+        let y_at = y_row * n + min(first + index % 4u, last);
+        let w_at = w_column + 4u * min(first + index / 16u, last) * stride;
         let ys = transpose(mat4x4(d_y[y_at.x], d_y[y_at.y], d_y[y_at.z], d_y[y_at.w])) * within;
         let ws = mat4x4(weights[w_at], weights[w_at + stride], weights[w_at + 2u * stride], weights[w_at + 3u * stride]);
         workgroupBarrier();
@@ -138,8 +140,8 @@ fn main(
     }
     let row = first_row + 4u * local.y;
     let in_ = first_in + 4u * local.x;
-    store(group, row, in_, sums.aa);
-    store(group, row, in_ + 32u, sums.ab);
-    store(group, row + 32u, in_, sums.ba);
-    store(group, row + 32u, in_ + 32u, sums.bb);
+    store(part, row, in_, sums.aa);
+    store(part, row, in_ + 32u, sums.ab);
+    store(part, row + 32u, in_, sums.ba);
+    store(part, row + 32u, in_ + 32u, sums.bb);
 }

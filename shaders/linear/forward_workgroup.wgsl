@@ -11,8 +11,7 @@ struct Params {
     out_features: u32,
     weight_stride: u32,
     accumulate: u32,
-    first_out: u32,
-    end_out: u32,
+    chunk_outs: u32,
     chunk_rows: u32,
     chunks: u32,
 }

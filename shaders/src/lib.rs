@@ -40,7 +40,7 @@ pub struct Binding {
 /// What a faster form of a kernel needs before it may replace the plain one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Requirement {
-    /// Every parameter named `features`, `in_features`, `out_features`, `first_out` or `end_out` is a multiple of 4 (f32
+    /// Every parameter named `features`, `in_features`, `out_features` or `chunk_outs` is a multiple of 4 (f32
     /// buffers may be read as `vec4<f32>`).
     FeaturesMultipleOf4,
     /// None of those parameters exceeds 256.

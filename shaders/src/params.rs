@@ -134,13 +134,11 @@ params! {
         weight_stride: u32,
         /// 1: add to the output, 0: overwrite it.
         accumulate: u32,
-        /// First output feature of this dispatch (`backward_input`, which splits long sums).
-        first_out: u32,
-        /// One past the last output feature of this dispatch (`backward_input`).
-        end_out: u32,
+        /// Output features per partial sum (`backward_input`).
+        chunk_outs: u32,
         /// Rows per partial sum (`backward_weight`).
         chunk_rows: u32,
-        /// Partial sums per group (`backward_weight`): `ceil(rows_per_group / chunk_rows)`.
+        /// Partial sums per group: `ceil(out_features / chunk_outs)` (`backward_input`), `ceil(rows_per_group / chunk_rows)` (`backward_weight`).
         chunks: u32,
     }
     /// `point_layer/*`.

@@ -110,7 +110,8 @@ table! {
         or "forward_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
         or "forward_subgroup" tile [128, 64, 1], when [FeaturesMultipleOf4, Subgroups],
         or "forward_cooperative" tile [64, 128, 1], when [FeaturesMultipleOf4, FeaturesAtMost1024, CooperativeMatrices];
-    /// `d_x[r,i] (+)= Σ_{o=first_out}^{end_out-1} W[o,i] d_y[r,o]`. Extent: rows of a group × in_features × groups.
+    /// `d_x[g,c,r,i] (+)= Σ_o W[o,i] d_y[g,r,o]` over the output features of chunk `c`, `d_x [groups, chunks, rows_per_group, in]`.
+    /// Extent: rows of a group × in_features × (groups · chunks).
     LINEAR_BACKWARD_INPUT = "linear"/"backward_input", LinearParams, tile [64, 32, 1],
         (d_y: f32, weights: f32, slots: u32) -> (d_x: f32),
         or "backward_input_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],

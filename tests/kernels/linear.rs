@@ -56,23 +56,24 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
     tolerance: 1e-5,
     cases: backward_input,
     faults: &[
-        ("backward_input", "o = params.first_out", "o = 0u"),
-        ("backward_input", "o < params.end_out", "o < params.out_features"),
+        ("backward_input", "o = begin", "o = 0u"),
+        ("backward_input", "min(begin + params.chunk_outs, params.out_features)", "params.out_features"),
         ("backward_input", "x5 += w * d_y[y_b.y", "x5 += w * d_y[y_b.x"),
         ("backward_input", "slots[params.first_group + group]", "slots[group]"),
         ("backward_input", "accumulate == 1u", "accumulate == 0u"),
-        ("backward_input_vec4", "o = params.first_out", "o = 0u"),
+        ("backward_input_vec4", "o = begin / 4u", "o = 0u"),
+        ("backward_input_vec4", "store(part, row, in_ + 4u, x_ab)", "store(group, row, in_ + 4u, x_ab)"),
         ("backward_input_vec4", "x_ba += wa * yb", "x_ba += wb * yb"),
         ("backward_input_vec4", "weights[at + 3u * stride]", "weights[at + 2u * stride]"),
         ("backward_input_vec4", "accumulate == 1u", "accumulate == 0u"),
-        ("backward_input_workgroup", "first = params.first_out / 4u", "first = 0u"),
+        ("backward_input_workgroup", "first = begin / 4u", "first = 0u"),
         ("backward_input_workgroup", "slots[params.first_group + group]", "slots[group]"),
         ("backward_input_workgroup", "64u * (index / 16u)", "64u * (index / 32u)"),
-        ("backward_input_workgroup", "first + index % 4u < end", "first + index % 4u <= end"),
+        ("backward_input_workgroup", "first + index % 4u <= last", "first + index % 4u <= last + 1u"),
         ("backward_input_workgroup", "multiply_add(&sums, local, 13u)", "multiply_add(&sums, local, 12u)"),
         ("backward_input_workgroup", "ab += outer(ya, wb)", "ab += outer(ya, wa)"),
         ("backward_input_workgroup", "accumulate == 1u", "accumulate == 0u"),
-        ("backward_input_subgroup", "o = params.first_out", "o = 0u"),
+        ("backward_input_subgroup", "o = begin / 4u", "o = 0u"),
         ("backward_input_subgroup", "slots[params.first_group + group]", "slots[group]"),
         ("backward_input_subgroup", "subgroupShuffle(mine, first + 7u)", "subgroupShuffle(mine, first + 6u)"),
         ("backward_input_subgroup", "weights[at + 3u * stride]", "weights[at + 2u * stride]"),
@@ -193,11 +194,19 @@ fn forward_case(size: Size) -> Case {
     s.finish()
 }
 
-/// The last two sum so many outputs that they take two dispatches.
+/// The last ones sum so many outputs that they go in parts.
 fn backward_input() -> Vec<Case> {
     let rows = |rows_per_group| Rows { groups: 1, rows_per_group, first_group: 0 };
-    let wide = |rows, in_features, out_features| Size { rows, in_features, out_features, sets: 1, accumulate: false };
-    sizes().chain([wide(rows(3), 3, 16_390), wide(rows(33), 4, 16_392)]).map(backward_input_case).collect()
+    let wide = |rows, in_features, out_features, sets| Size { rows, in_features, out_features, sets, accumulate: sets > 1 };
+    let two = Rows { groups: 2, rows_per_group: 7, first_group: 1 };
+    let wide = [
+        wide(rows(3), 3, 2050, 1),
+        wide(rows(33), 4, 2052, 1),
+        wide(rows(1030), 4, 16_392, 1),
+        wide(two, 8, 1028, 3),
+        wide(two, 5, 1030, 3),
+    ];
+    sizes().chain(wide).map(backward_input_case).collect()
 }
 
 fn backward_input_case(size: Size) -> Case {

@@ -177,11 +177,11 @@ impl RowWise for LinearParams {
     }
 
     fn rows_per_group(&self) -> Option<usize> {
-        (self.weight_stride > 0 || self.chunks > 0).then_some(self.rows_per_group as usize)
+        (self.weight_stride > 0 || self.chunk_rows > 0).then_some(self.rows_per_group as usize)
     }
 
     fn chunk_rows(&self) -> Option<usize> {
-        (self.chunks > 0).then_some(self.chunk_rows as usize)
+        (self.chunk_rows > 0).then_some(self.chunk_rows as usize)
     }
 
     fn block(self, rows: Range<usize>) -> Self {

@@ -479,7 +479,8 @@ references! {
         "tile/scatter" => tile::scatter(f) -> (f_mut), |p: TileParams| [p.columns, p.columns],
             from [0, tile::first(p)] unless tile::has_gaps(p);
         "linear/forward" => linear::forward(f f u) -> (f_mut), |p: LinearParams| [p.in_features, 0, 0, p.out_features];
-        "linear/backward_input" => linear::backward_input(f f u) -> (f_mut), |p: LinearParams| [p.out_features, 0, 0, p.in_features];
+        "linear/backward_input" => linear::backward_input(f f u) -> (f_mut), |p: LinearParams| [p.out_features, 0, 0, p.in_features],
+            from [0, 0, 0, 0] unless p.chunks > 1;
         "linear/backward_weight" => linear::backward_weight(f f) -> (f_mut), |p: LinearParams| [p.in_features, p.out_features],
             sum of p.out_features * (p.in_features + 1);
         "layer_norm_relu/forward" => layer_norm_relu::forward(f f) -> (f_mut f_mut),

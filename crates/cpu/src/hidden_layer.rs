@@ -45,7 +45,7 @@ pub(crate) fn backward<T: Real>(
     d_z: &mut [T],
 ) {
     let [ins, outs] = [p.in_features, p.out_features].map(|size| size as usize);
-    linear::with_backward_input(p, weights, slots, 0, |at_a_time, layer| {
+    linear::with_backward_input(p, weights, slots, 0, 0..outs, |at_a_time, layer| {
         for rows in parts(z.len() / ins, at_a_time) {
             let values = rows.start * ins..rows.end * ins;
             let (z, d_y, stats) = (&z[values.clone()], &mut d_y[values.clone()], &stats[2 * rows.start..2 * rows.end]);
@@ -76,7 +76,8 @@ mod tests {
             rows_per_group: rows as u32,
             in_features: ins as u32,
             out_features: outs as u32,
-            end_out: outs as u32,
+            chunk_outs: outs as u32,
+            chunks: 1,
             accumulate: accumulate.into(),
             ..bytemuck::Zeroable::zeroed()
         };

@@ -146,7 +146,7 @@ fn is_usable(variant: &Variant, step: &Step, gpu: &Gpu) -> bool {
 
 /// The parameters of a step that are numbers of features.
 fn widths(step: &Step) -> impl Iterator<Item = u32> {
-    let names = ["features", "in_features", "out_features", "first_out", "end_out", "hidden"];
+    let names = ["features", "in_features", "out_features", "chunk_outs", "hidden"];
     let fields = step.kernel.params.fields.iter().filter(move |field| names.contains(&field.0));
     fields.map(|&(_, _, offset)| bytemuck::pod_read_unaligned(&step.params[offset..offset + 4]))
 }

@@ -1,5 +1,7 @@
 //! Linear layers: blocks of rows through `layer.rs`, where it can, all else through a matrix library.
 
+use std::ops::Range;
+
 use gemm::{Parallelism, gemm};
 use srn_shaders::LinearParams;
 
@@ -112,28 +114,29 @@ pub(crate) fn with_forward<T: Real>(
     });
 }
 
-/// `work` with `d_x (+)= d_y W` for rows of group `group`, over the outputs `first_out..end_out`, and with how many to take at a time.
+/// `work` with `d_x (+)= d_y W` for rows of group `group`, over some outputs, and with how many to take at a time.
 pub(crate) fn with_backward_input<T: Real>(
     p: LinearParams,
     weights: &[T],
     slots: &[u32],
     group: usize,
+    over: Range<usize>,
     work: impl FnOnce(usize, Rows<T>),
 ) {
     let [ins, outs] = [p.in_features, p.out_features].map(|size| size as usize);
-    let [first, end] = [p.first_out as usize, p.end_out as usize];
-    let weight = &weights_of(p, weights, slots, group)[first * ins..end * ins];
+    let (first, count) = (over.start, over.len());
+    let weight = &weights_of(p, weights, slots, group)[first * ins..over.end * ins];
     let accumulate = p.accumulate == 1;
-    if is_ours::<T>(end - first, ins) {
+    if is_ours::<T>(count, ins) {
         let begin = if accumulate { Begin::Before } else { Begin::Zero };
-        return layer::with_layer(end - first, ins, Weights::InputsByOutputs(singles(weight)), |layer| {
+        return layer::with_layer(count, ins, Weights::InputsByOutputs(singles(weight)), |layer| {
             work(FEW_ROWS, &|d_y, d_x, soon| {
                 layer.product(&singles(d_y)[first..], outs, begin, singles_mut(d_x), singles(soon));
             });
         });
     }
     work(ALL_ROWS, &|d_y, d_x, _| {
-        let size = [d_x.len() / ins, ins, end - first];
+        let size = [d_x.len() / ins, ins, count];
         product(size, d_x, Matrix(&d_y[first..], [outs, 1]), Matrix(weight, [ins, 1]), accumulate, threads());
     });
 }
@@ -147,12 +150,16 @@ pub fn forward<T: Real>(p: LinearParams, x: &[T], weights: &[T], slots: &[u32], 
     }
 }
 
-/// `d_x (+)= d_y W`, over the outputs `first_out..end_out`.
+/// `d_x (+)= d_y W`, per group and chunk of outputs.
 pub fn backward_input<T: Real>(p: LinearParams, d_y: &[T], weights: &[T], slots: &[u32], d_x: &mut [T]) {
     let [rows, ins, outs] = [p.rows_per_group, p.in_features, p.out_features].map(|size| size as usize);
-    let groups = d_x.chunks_exact_mut(rows * ins).zip(d_y.chunks_exact(rows * outs));
+    let [chunk_outs, chunks] = [p.chunk_outs, p.chunks].map(|size| size as usize);
+    let groups = d_x.chunks_exact_mut(chunks * rows * ins).zip(d_y.chunks_exact(rows * outs));
     for (group, (d_x, d_y)) in groups.enumerate().take(p.groups as usize) {
-        with_backward_input(p, weights, slots, group, |_, rows| rows(d_y, d_x, &[]));
+        for (chunk, d_x) in d_x.chunks_exact_mut(rows * ins).enumerate() {
+            let over = chunk * chunk_outs..outs.min((chunk + 1) * chunk_outs);
+            with_backward_input(p, weights, slots, group, over, |_, rows| rows(d_y, d_x, &[]));
+        }
     }
 }
 

@@ -68,7 +68,8 @@ fn map(p: PointLayerParams) -> LinearParams {
         first_group: p.first_group,
         in_features: 3,
         out_features: p.features,
-        end_out: p.features,
+        chunk_outs: p.features,
+        chunks: 1,
         weight_stride: p.weight_stride,
         ..Default::default()
     }

@@ -5,8 +5,11 @@ use srn_shaders::{LINEAR_BACKWARD_INPUT, LINEAR_BACKWARD_WEIGHT, LINEAR_FORWARD,
 use super::{output, read, size, sum};
 use crate::{BufferId, Builder, Parts, PlanError, Rows};
 
-/// Output features per dispatch of [`backward_input`]: bounds the loop of one invocation.
-const MOST_OUT: u32 = 16_384;
+/// Output features that one sum of [`backward_input`] goes over at most, for few rows and for many: longer sums go in parts, which side by side keep a
+/// GPU busy that has few rows, and bound the loop of one invocation.
+const MOST_OUT: [u32; 2] = [1024, 16_384];
+/// Rows that are few.
+const FEW_ROWS: u32 = 1024;
 
 /// A linear layer: its sizes and where its weights are.
 #[derive(Clone, Copy, Debug)]
@@ -70,7 +73,6 @@ impl Layer {
             out_features: self.out_features,
             weight_stride: self.stride(),
             accumulate: accumulate.into(),
-            end_out: self.out_features,
             ..Default::default()
         }
     }
@@ -107,7 +109,7 @@ pub fn forward(
     b.step(&LINEAR_FORWARD, layer.params(rows, accumulate), &args, extent, loops, layer.flops(rows))
 }
 
-/// `d_x [rows, in] (+)= d_y [rows, out] W`.
+/// `d_x [rows, in] (+)= d_y [rows, out] W`; long sums by way of their parts.
 pub fn backward_input(
     b: &mut Builder,
     rows: Rows,
@@ -118,20 +120,23 @@ pub fn backward_input(
     accumulate: bool,
 ) -> Result<(), PlanError> {
     let rows = layer.rows(rows);
-    for first_out in (0..layer.out_features).step_by(MOST_OUT as usize) {
-        let accumulate = accumulate || first_out > 0;
-        let end_out = layer.out_features.min(first_out + MOST_OUT);
-        let args = [
-            read(d_y, size([rows.count(), layer.out_features])),
-            read(layer.weights, layer.weights_len()),
-            read(slots, size([rows.first_group + rows.groups])),
-            output(d_x, size([rows.count(), layer.in_features]), accumulate),
-        ];
-        let params = LinearParams { first_out, end_out, ..layer.params(rows, accumulate) };
-        let extent = [rows.rows_per_group, layer.in_features, rows.groups];
-        let outs = end_out - first_out;
-        let flops = 2 * u64::from(rows.count()) * u64::from(layer.in_features) * u64::from(outs);
-        b.step(&LINEAR_BACKWARD_INPUT, params, &args, extent, loops(outs), flops)?;
+    let most = MOST_OUT[usize::from(rows.count() > FEW_ROWS)];
+    let (chunk_outs, chunks) = (layer.out_features.min(most), layer.out_features.div_ceil(most).max(1));
+    let values = size([rows.count(), layer.in_features]);
+    let in_parts = chunks > 1;
+    let to = if in_parts { b.scratch("parts of long sums", chunks as usize * values)? } else { d_x };
+    let args = [
+        read(d_y, size([rows.count(), layer.out_features])),
+        read(layer.weights, layer.weights_len()),
+        read(slots, size([rows.first_group + rows.groups])),
+        output(to, chunks as usize * values, accumulate && !in_parts),
+    ];
+    let params = LinearParams { chunk_outs, chunks, ..layer.params(rows, accumulate && !in_parts) };
+    let extent = [rows.rows_per_group, layer.in_features, rows.groups * chunks];
+    b.step(&LINEAR_BACKWARD_INPUT, params, &args, extent, loops(chunk_outs), layer.flops(rows))?;
+    if in_parts {
+        let groups = sum::Groups { count: rows.groups, first: 0 };
+        sum::forward(b, groups, chunks, rows.rows_per_group * layer.in_features, to, d_x, accumulate)?;
     }
     Ok(())
 }
