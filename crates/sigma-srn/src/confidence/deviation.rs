@@ -51,6 +51,8 @@ pub const WITHIN_95: f64 = 12.591_587;
 /// found; and by which part of that, since what is cut away, or left on, is hardly the same all around (the latter two are standard deviations). By pictures
 /// whose masks were made wrong (`docs/accuracy.md`).
 const CUT_OUT: f64 = 2.0;
+/// How much larger variances are where a mask hides all around the object: by pictures of objects on a table (`docs/accuracy.md`).
+const WITHOUT_OUTLINE: f64 = 5.0;
 const OUTLINE: f64 = 0.25;
 const OF_MOVED: f64 = 0.3;
 
@@ -88,7 +90,8 @@ impl Estimate {
 
     /// Covariance of the motion from the estimated pose of this instance to the true one; `None` where there is no [`Estimate::shape`].
     pub fn covariance(&self, instance: &str, calibration: &Calibration) -> Option<Matrix6> {
-        let size = calibration.sizes.get(instance).copied().unwrap_or(1.0);
+        let of_picture = if self.is_without_outline { WITHOUT_OUTLINE } else { 1.0 };
+        let size = of_picture * calibration.sizes.get(instance).copied().unwrap_or(1.0);
         let mixed = mixed(&self.shape()?, calibration.curvature, &calibration.floor_of(self));
         let Some(outline) = self.outline else { return Some(mixed.map(|row| row.map(|entry| size * entry))) };
         // The views that a calibration is from have no masks. An object whose outline is taken to be farther out seems larger, and nearer.

@@ -76,6 +76,7 @@ mod tests {
             curvature: Some(curvature()),
             light: None,
             outline: None,
+            is_without_outline: false,
             target: vec![],
             width: 64,
             extent: 0.5,

@@ -72,6 +72,8 @@ pub struct Estimate {
     pub light: Option<Light>,
     /// How the outline of the image's mask was moved at the end, if it has one.
     pub outline: Option<Outline>,
+    /// Whether a mask hides all around the object, so that nothing but its colours say how large it is.
+    pub is_without_outline: bool,
     /// The image as it was compared at the end, with this outline and in the model's light `[height, width, 3]`.
     pub target: Vec<f32>,
     /// Pixels per row of it.
@@ -349,7 +351,8 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         let width = query.width;
         let extent = query.intrinsics.fx / (pose.distance() * f64::from(width));
         let ranking = own.iter().map(ranked).collect();
-        Estimate { pose, loss, curvature, light, outline, target, width, extent, ranking }
+        let is_without_outline = query.coverage.is_some() && !query.has_outline();
+        Estimate { pose, loss, curvature, light, outline, is_without_outline, target, width, extent, ranking }
     }
 
     /// Takes hypotheses through a phase, those of a query one after the other, the best first. What second derivatives say at its end is found out where

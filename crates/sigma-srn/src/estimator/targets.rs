@@ -72,7 +72,7 @@ impl Targets {
             let (_, coverage) = query.seen(hypothesis.outline);
             if query.coverage.is_some() {
                 let coverage: Vec<f32> = query.pixels(stride).map(|pixel| coverage[pixel]).collect();
-                let between = || Light::between(rgb, render, &coverage, &query.ray_weights(stride));
+                let between = || Light::between(rgb, render, &coverage, &query.ray_weights(stride), query.has_outline());
                 lights[hypothesis.query].get_or_insert_with(between).undo(rgb, &coverage);
             }
         }
