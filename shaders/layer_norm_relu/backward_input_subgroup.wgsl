@@ -70,9 +70,11 @@ fn main(
     let n = params.features / 4u;
     let per_row = select(select(select(1u, 2u, n > 8u), 4u, n > 16u), 8u, n > 32u);
     let team = (subgroup * subgroup_size + lane) / 8u;
+    // Rows side by side for each team, in whole turns.
     let turn = 8u / per_row;
-    let first = turn * (4u * (workgroup.y * workgroups.x + workgroup.x) + team);
-    let all_teams = 4u * workgroups.x * workgroups.y;
+    let of_all = turn * 4u * workgroups.x * workgroups.y;
+    let share = turn * ((params.rows + of_all - 1u) / of_all);
+    let first = share * (4u * (workgroup.y * workgroups.x + workgroup.x) + team);
     // Columns of the vectors; the last one stands in for those beyond the row, which count as zero and are not stored.
     let c0 = lane % 8u;
     let c1 = lane % 8u + 8u * (1u % per_row);
@@ -108,7 +110,7 @@ fn main(
     let beta7 = affine[n + j7];
     let octet = lane - lane % 8u;
     let last = params.rows - 1u;
-    for (var row = first; row < params.rows; row += turn * all_teams) {
+    for (var row = first; row < min(first + share, params.rows); row += turn) {
         let r0 = row;
         let r1 = row + 1u / per_row;
         let r2 = row + 2u / per_row;

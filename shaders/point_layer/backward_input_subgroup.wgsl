@@ -130,14 +130,16 @@ fn main(
     let member = lane % 8u;
     let octet = lane - member;
     let team = (subgroup * subgroup_size + lane) / 8u;
+    // Rows side by side for each team, in whole turns.
     let turn = 8u / per_row;
-    let first = turn * (4u * workgroup.x + team);
-    let all_teams = 4u * workgroups.x;
+    let of_all = turn * 4u * workgroups.x;
+    let share = turn * ((params.rows_per_group + of_all - 1u) / of_all);
+    let first = share * (4u * workgroup.x + team);
     let group = workgroup.z;
     if (first >= params.rows_per_group) {
         return;
     }
-    let end = params.rows_per_group;
+    let end = min(first + share, params.rows_per_group);
     let first_weight = weights_of(group) / 4u;
     // Columns of the vectors.
     let c0 = member;
@@ -201,7 +203,7 @@ fn main(
     let beta5 = affine[n + j5];
     let beta6 = affine[n + j6];
     let beta7 = affine[n + j7];
-    for (var row = first; row < end; row += turn * all_teams) {
+    for (var row = first; row < end; row += turn) {
         // Each lane loads the point of one row.
         let of_mine = 3u * (group * params.rows_per_group + min(row + member, end - 1u));
         let mine = vec3(x[of_mine], x[of_mine + 1u], x[of_mine + 2u]);

@@ -27,7 +27,7 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_subgroup", "b + b.zwxy, per_row > 2u", "b + b.zwxy, per_row > 4u"),
         ("forward_subgroup", "subgroupShuffleXor(a, 4u)", "subgroupShuffleXor(a, 2u)"),
         ("forward_subgroup", "pick(rstd, lane % 8u * per_row)", "pick(rstd, lane % 8u)"),
-        ("forward_short", "turn * (4u * (workgroup", "turn * (3u * (workgroup"),
+        ("forward_short", "share * (4u * (workgroup", "share * (3u * (workgroup"),
     ],
 };
 
@@ -52,7 +52,7 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
         ("backward_input_subgroup", "octet + 5u / per_row", "octet"),
         ("backward_input_subgroup", "subgroupShuffleXor(b, 1u)", "subgroupShuffleXor(b, 4u)"),
         ("backward_input_subgroup", "dot(e6, x6)", "dot(e6, e6)"),
-        ("backward_input_short", "turn * (4u * (workgroup", "turn * (3u * (workgroup"),
+        ("backward_input_short", "share * (4u * (workgroup", "share * (3u * (workgroup"),
     ],
 };
 
