@@ -91,7 +91,7 @@ fn a_profile_times_every_kernel() {
     }
     let mut executor = GpuExecutor::new(gpu(), b.finish().unwrap(), u64::MAX).unwrap();
     executor.write(z, &[1.0; 1000]).unwrap();
-    let times = executor.profile(stage).unwrap();
+    let times = executor.profile(&[stage]).unwrap();
     assert_eq!(executor.read(loss).unwrap(), [1000.0]);
     let mut labels: Vec<_> = times.iter().map(|time| (time.label.as_str(), time.steps)).collect();
     labels.sort();

@@ -6,7 +6,7 @@ use srn_plan::{Executor, ExecutorError, StageId};
 use crate::executor::Launch;
 use crate::{Gpu, GpuExecutor, launch};
 
-/// Time on the device of all steps of a stage that ran one kernel variant.
+/// Time on the device of all steps that ran one kernel variant.
 #[derive(Clone, Debug, PartialEq)]
 pub struct KernelTime {
     /// `op/variant`.
@@ -20,17 +20,20 @@ pub struct KernelTime {
 }
 
 impl GpuExecutor {
-    /// Runs a stage with a timestamp before and after each step; the slowest kernel comes first.
+    /// Runs stages with a timestamp before and after each step; the slowest kernel comes first.
     ///
     /// Needs a device with `TIMESTAMP_QUERY` ([`Gpu::open`](crate::Gpu::open) asks for it). Steps cannot overlap in this
     /// run, so the sum may exceed the time of a plain run.
-    pub fn profile(&mut self, stage: StageId) -> Result<Vec<KernelTime>, ExecutorError> {
+    pub fn profile(&mut self, stages: &[StageId]) -> Result<Vec<KernelTime>, ExecutorError> {
         if !self.gpu().device().features().contains(wgpu::Features::TIMESTAMP_QUERY) {
             return Err(ExecutorError::Device { what: format!("{} has no timestamps", self.describe()) });
         }
         self.attempt(|this| {
             let mut times: BTreeMap<&str, KernelTime> = BTreeMap::new();
-            for part in launch::submissions(&this.plan().stage(stage).steps) {
+            let parts = stages.iter().flat_map(|&stage| {
+                launch::submissions(&this.plan().stage(stage).steps).into_iter().map(move |part| (stage, part))
+            });
+            for (stage, part) in parts {
                 let launches: Vec<&Launch> = this.launches(stage)[part.clone()].iter().collect();
                 let seconds = this.gpu().time(&launches)?;
                 for (index, seconds) in part.zip(seconds) {

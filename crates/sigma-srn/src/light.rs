@@ -15,7 +15,7 @@ const NOISE: f64 = 4e-4;
 const CONTRASTS: [f64; 2] = [0.4, 2.5];
 /// From which correlation of picture and view on the contrast between them is believed, and from which altogether, where the picture does not show where the
 /// object ends. Nothing keeps a search from going closer there, where it sees a flat part of one surface; with all contrast taken off the picture that would explain
-/// it. At poses found right they agree to 0.6 to 0.95, at such ones to 0.2 to 0.57 (`docs/accuracy.md`).
+/// it. At poses found right they agree to 0.6 to 0.95, at such ones to 0.2 to 0.58 (`docs/accuracy.md`).
 const AGREE: [f64; 2] = [0.6, 0.85];
 
 /// What takes the colours of an object in a picture to those that it has in the model's light: `contrast · colour + offset`, colours in

@@ -267,22 +267,10 @@ impl Trainer {
     /// without what stays on the host.
     pub fn profile(&mut self) -> Result<Option<Vec<srn_gpu::KernelTime>>, Error> {
         let Handles { before, render, after, update, .. } = self.handles;
-        let Runner::Gpu(executor) = &mut self.runner else { return Ok(None) };
-        let mut times: Vec<srn_gpu::KernelTime> = Vec::new();
-        for stage in [before, render, after, update] {
-            for time in executor.profile(stage)? {
-                match times.iter_mut().find(|known| known.label == time.label) {
-                    None => times.push(time),
-                    Some(known) => {
-                        known.steps += time.steps;
-                        known.seconds += time.seconds;
-                        known.flops += time.flops;
-                    }
-                }
-            }
+        match &mut self.runner {
+            Runner::Gpu(executor) => Ok(Some(executor.profile(&[before, render, after, update])?)),
+            Runner::Cpu(_) => Ok(None),
         }
-        times.sort_by(|a, b| b.seconds.total_cmp(&a.seconds));
-        Ok(Some(times))
     }
 
     /// The executor, whose plan names every buffer: for tests against golden values and lockstep.

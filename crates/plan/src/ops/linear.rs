@@ -5,10 +5,10 @@ use srn_shaders::{LINEAR_BACKWARD_INPUT, LINEAR_BACKWARD_WEIGHT, LINEAR_FORWARD,
 use super::{output, read, size, sum};
 use crate::{BufferId, Builder, Parts, PlanError, Rows};
 
-/// Output features that one sum of [`backward_input`] goes over at most, for few rows and for many: longer sums go in parts, which side by side keep a
-/// GPU busy that has few rows, and bound the loop of one invocation.
-const MOST_OUT: [u32; 2] = [1024, 16_384];
-/// Rows that are few.
+/// Output features that one sum of [`backward_input`] goes over at most: bounds the loop of one invocation. Longer sums go in parts.
+const MOST_OUT: u32 = 16_384;
+/// The same of so few rows that they would leave most of a GPU idle: parts run side by side.
+const MOST_OUT_OF_FEW: u32 = 1024;
 const FEW_ROWS: u32 = 1024;
 
 /// A linear layer: its sizes and where its weights are.
@@ -120,7 +120,7 @@ pub fn backward_input(
     accumulate: bool,
 ) -> Result<(), PlanError> {
     let rows = layer.rows(rows);
-    let most = MOST_OUT[usize::from(rows.count() > FEW_ROWS)];
+    let most = if rows.count() <= FEW_ROWS { MOST_OUT_OF_FEW } else { MOST_OUT };
     let (chunk_outs, chunks) = (layer.out_features.min(most), layer.out_features.div_ceil(most).max(1));
     let values = size([rows.count(), layer.in_features]);
     let in_parts = chunks > 1;

@@ -277,6 +277,15 @@ mod tests {
         assert_eq!([0.4, 0.5].map(|extent| known.is_small(extent)), [true, false]);
     }
 
+    #[test]
+    fn a_mask_that_hides_the_outline_leaves_a_pose_much_less_sure() {
+        let variance = |is_without_outline| {
+            let estimate = Estimate { is_without_outline, ..estimate(look_at_origin(DVec3::new(0.0, 1.3, 0.0))) };
+            estimate.covariance("", &calibration(0.0, [1e-4; 6])).unwrap()[0][0]
+        };
+        assert_eq!([false, true].map(|hides| (1e4 * variance(hides)).round()), [1.0, 5.0]);
+    }
+
     /// Where a mask says where the object ends all errors grow, and an outline that may be a quarter of a pixel off moves the camera by as large a part of
     /// its distance as that is of half the object's diagonal.
     #[test]

@@ -157,7 +157,7 @@ impl Descent {
     pub fn profile(&mut self) -> Result<Option<Vec<srn_gpu::KernelTime>>, Error> {
         let stage = self.evaluation();
         match &mut self.runner {
-            Runner::Gpu(executor) => Ok(Some(executor.profile(stage)?)),
+            Runner::Gpu(executor) => Ok(Some(executor.profile(&[stage])?)),
             Runner::Cpu(_) => Ok(None),
         }
     }
