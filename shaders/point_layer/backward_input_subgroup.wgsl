@@ -132,9 +132,9 @@ fn main(
     let team = (subgroup * subgroup_size + lane) / 8u;
     // Rows side by side for each team, in whole turns.
     let turn = 8u / per_row;
-    let of_all = turn * 4u * workgroups.x;
+    let of_all = turn * 4u * workgroups.x * workgroups.y;
     let share = turn * ((params.rows_per_group + of_all - 1u) / of_all);
-    let first = share * (4u * workgroup.x + team);
+    let first = share * (4u * (workgroup.y * workgroups.x + workgroup.x) + team);
     let group = workgroup.z;
     if (first >= params.rows_per_group) {
         return;

@@ -33,8 +33,12 @@ fn linear(first: u32, j: u32, point: vec3<f32>) -> f32 {
 }
 
 @compute @workgroup_size(64)
-fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_id) local: vec3<u32>) {
-    let row = 64u * workgroup.x + local.x;
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_id) local: vec3<u32>,
+) {
+    let row = flat_index(workgroup, workgroups, local);
     let group = workgroup.z;
     if (row >= params.rows_per_group || group >= params.groups) {
         return;

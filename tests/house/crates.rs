@@ -94,6 +94,16 @@ fn libraries_never_print_and_never_panic_on_what_they_are_given() {
     }
 }
 
+/// What a device is known to compute holds for one translation of the kernels.
+#[test]
+fn the_translator_of_kernels_is_the_one_in_use() {
+    let lock = text("Cargo.lock").replace("\r\n", "\n");
+    let version =
+        lock.split_once("name = \"naga\"\nversion = \"").and_then(|(_, rest)| rest.split_once('"')).expect("naga is locked").0;
+    let named = format!("const TRANSLATOR: &str = \"naga {version}\";");
+    assert!(text("crates/gpu/src/gpu.rs").contains(&named), "crates/gpu/src/gpu.rs: no `{named}`");
+}
+
 #[test]
 fn exceptions_from_lints_give_a_reason() {
     for folder in ["shaders", "crates", "tests", "xtask"] {

@@ -135,14 +135,14 @@ fn a_measured_choice_is_kept() {
         std::fs::write(&file, kept.replace(&first, other)).unwrap();
         assert_eq!(chosen(&measured()), other);
     }
-    // What is not a choice is measured again; nothing but the file is left.
+    // What is not a choice is measured again; nothing but the file and its lock is left.
     for broken in [kept.replace(&first, "linear/no_such_variant").into_bytes(), b"\xff\xfe {]".to_vec(), vec![]] {
         std::fs::write(&file, broken).unwrap();
         assert!(chosen(&measured()).starts_with("linear/forward"));
         let again = std::fs::read_to_string(&file).unwrap();
         assert!(again.lines().any(|line| line.starts_with(&kept[..16]) && !line.contains("no_such")), "{again}");
     }
-    assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1);
+    assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 2);
 }
 
 #[test]

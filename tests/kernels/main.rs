@@ -2,9 +2,11 @@
 //!
 //! `<op>.rs` holds a [`KernelTest`] and a test for each direction of an op. Sizes are odd, groups several, outputs poisoned.
 
+use std::collections::BTreeSet;
+
 use srn_cpu::Precision;
 use srn_gpu::{Choice, Gpu, GpuExecutor, wgpu};
-use srn_plan::{Executor, ExecutorError, Kernel, Rows};
+use srn_plan::{Executor, ExecutorError, Kernel, Rows, Step};
 use srn_shaders::{Requirement, TABLE, Variant};
 use srn_tests::{Case, Divergence, cooperative_gpu, gpu, lockstep};
 
@@ -207,6 +209,55 @@ fn every_kernel_has_a_test_and_every_variant_a_planted_fault() {
                 assert_ne!(plant(&source, from, to), source.trim_end(), "{}/{}: no `{from}`", test.kernel.op, variant.name);
             }
         }
+    }
+}
+
+/// The same adapter, for grids of at most so many workgroups in one dimension.
+fn gpu_with_grids_of(most: u32) -> Gpu {
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
+    let is_wanted = |adapter: &wgpu::Adapter| {
+        let (info, wanted) = (adapter.get_info(), gpu().adapter());
+        info.name == wanted.name && format!("{:?}", info.backend) == wanted.backend
+    };
+    let mut found = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::all())).into_iter().filter(is_wanted);
+    let adapter = found.next().expect("the test's adapter is there");
+    let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+        required_features: adapter.features() & wgpu::Features::SUBGROUP,
+        required_limits: wgpu::Limits { max_compute_workgroups_per_dimension: most, ..Default::default() },
+        ..Default::default()
+    }))
+    .expect("a device with small limits");
+    Gpu::from_device(device, queue)
+}
+
+/// What has more workgroups than one dimension of a grid holds, millions of rows, has them in two.
+#[test]
+fn long_grids_are_folded() {
+    const MOST: u32 = 2;
+    let gpu = gpu_with_grids_of(MOST);
+    let mut folded = BTreeSet::new();
+    for test in ALL {
+        let is_flat = |variant: &&Variant| variant.tile[1..] == [1, 1] && device(variant).is_some();
+        let is_cooperative = |variant: &&Variant| variant.requires.contains(&Requirement::CooperativeMatrices);
+        for variant in test.kernel.variants.iter().filter(is_flat).filter(|variant| !is_cooperative(variant)) {
+            let gpu = gpu.with_choice(Choice::Named(variant.name.into()));
+            let is_long = |step: &Step| {
+                let [x, y, z] = step.extent;
+                step.kernel.name == test.kernel.name && [y, z] == [1, 1] && x > MOST * variant.tile[0]
+            };
+            for case in (test.cases)().into_iter().filter(|case| case.plan.stage(case.stage).steps.iter().any(is_long)) {
+                // Other steps of a case may have grids that cannot be folded.
+                let Ok(mut executor) = GpuExecutor::new(&gpu, case.plan.clone(), u64::MAX) else { continue };
+                if test.runs(&case, &executor, variant) {
+                    test.worst(&case, &mut executor).unwrap_or_else(|what| panic!("{}: {what}", case.name));
+                    folded.insert(test.kernel.label(variant));
+                }
+            }
+        }
+    }
+    println!("folded: {folded:?}");
+    for label in ["point_layer/forward", "point_layer/backward_input", "layer_norm_relu/forward", "lstm_cell/backward_vec4"] {
+        assert!(folded.contains(label), "{label}: {folded:?}");
     }
 }
 

@@ -26,10 +26,10 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_subgroup", "f32(c < params.features / 4u)", "1.0"),
         ("forward_subgroup", "octet + 5u / per_row", "octet"),
         ("forward_subgroup", "subgroupShuffleXor(mean, 4u)", "subgroupShuffleXor(mean, 2u)"),
-        ("forward_subgroup", "4u * workgroup.x + team", "4u * workgroup.x + team / 2u"),
+        ("forward_subgroup", "workgroup.x) + team", "workgroup.x) + team / 2u"),
         ("forward_subgroup", "max(value, vec4(0.0))", "value"),
         ("forward_subgroup", "end, c6, gamma6 * (z6 * rstd.b.z)", "end, c6, gamma6 * (z6 * rstd.b.x)"),
-        ("forward_short", "share * (4u * workgroup", "share * (3u * workgroup"),
+        ("forward_short", "share * (4u * (workgroup", "share * (3u * (workgroup"),
     ],
 };
 
@@ -53,7 +53,7 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
         ("backward_input_subgroup", "dot(w6.z, d6)", "dot(w6.y, d6)"),
         ("backward_input_subgroup", "k = member * per_row", "k = member"),
         ("backward_input_subgroup", "accumulate == 1u", "accumulate == 0u"),
-        ("backward_input_short", "share * (4u * workgroup", "share * (3u * workgroup"),
+        ("backward_input_short", "share * (4u * (workgroup", "share * (3u * (workgroup"),
     ],
 };
 

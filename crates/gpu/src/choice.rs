@@ -12,9 +12,12 @@ use srn_shaders::{Requirement, Variant};
 use crate::Gpu;
 use crate::executor::Launch;
 use crate::gpu::lock;
+use crate::launch::MOST_FLOPS;
 
 /// Where choices are kept: a line for each, a hash and `op/variant`, or what else was found of a device.
 const FILE: &str = "variants.txt";
+/// Who writes it holds this one, which is empty.
+const LOCK: &str = "variants.lock";
 
 /// How the variants of kernels are chosen.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -111,7 +114,7 @@ impl Chooser {
             Choice::Named(name) => usable.iter().find(|variant| variant.name.ends_with(name)).unwrap_or(&usable[0]),
             Choice::Measured { .. } => {
                 let texts: Vec<String> = usable.iter().map(|variant| gpu.source(step.kernel, variant)).collect();
-                let key = key(&format!("{} {shape:?} {texts:?}", gpu.adapter()));
+                let key = key(&format!("{} {shape:?} {texts:?}", gpu.identity()));
                 let kept = || {
                     let label = self.remembered(&key)?;
                     usable.iter().copied().find(|variant| step.kernel.label(variant) == label)
@@ -158,7 +161,7 @@ pub(crate) fn key(of: &str) -> String {
 }
 
 /// Work that a software adapter is timed on, in floating-point operations: a millisecond or a few, which other programs
-/// leave alone more often than not. A real GPU, which needs many rows to show what it can, is timed on the whole.
+/// leave alone more often than not. A real GPU, which needs many rows to show what it can, is timed on as much as one submission may have.
 const SAMPLE: u64 = 100_000_000;
 /// Most times that a variant is timed.
 const MOST_ROUNDS: usize = 20;
@@ -192,7 +195,8 @@ fn measure(
     launch: impl Fn(&Variant, [u32; 3]) -> Result<Launch, ExecutorError>,
 ) -> Result<&'static Variant, ExecutorError> {
     let (mut extent, mut flops) = (step.extent, step.flops);
-    while gpu.adapter().is_software && flops > SAMPLE {
+    let most = if gpu.adapter().is_software { SAMPLE } else { MOST_FLOPS };
+    while flops > most {
         // The rows of a group, or the groups; both for sums over rows.
         let longest = if extent[0] >= extent[2] { 0 } else { 2 };
         extent[longest] = extent[longest].div_ceil(2);
@@ -208,8 +212,14 @@ fn measure(
     if let [] | [_] = candidates[..] {
         return Ok(candidates.first().map_or(usable[0], |only| only.variant));
     }
+    // As many side by side as a submission may have.
+    let at_once = (MOST_FLOPS / flops.max(1)).max(1) as usize;
+    let time = |launches: &[&Launch]| {
+        let parts = launches.chunks(at_once).map(|part| gpu.time(part)).collect::<Result<Vec<_>, _>>();
+        parts.map(|parts| parts.concat())
+    };
     // The first time is that of compiling.
-    gpu.time(&candidates.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
+    time(&candidates.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
     for _ in 0..MOST_ROUNDS {
         let best = candidates.iter().map(|candidate| candidate.best).fold(f64::INFINITY, f64::min);
         let is_open = |candidate: &&mut Candidate| !(candidate.is_settled() && candidate.best > SAME * best);
@@ -217,7 +227,7 @@ fn measure(
         if open.len() <= 1 || (best.is_finite() && open.iter().all(|candidate| candidate.is_settled())) {
             break;
         }
-        let seconds = gpu.time(&open.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
+        let seconds = time(&open.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
         open.iter_mut().zip(seconds).for_each(|(candidate, seconds)| candidate.add(seconds));
     }
     let fastest = candidates.iter().min_by(|a, b| a.best.total_cmp(&b.best)).map_or(usable[0], |fastest| fastest.variant);
@@ -238,14 +248,30 @@ fn read(folder: &Path) -> io::Result<BTreeMap<String, String>> {
     Ok(lines.map(|(key, label)| (key.to_owned(), label.to_owned())).collect())
 }
 
-/// Adds a line to the file, which is written whole or not at all: another process may be reading.
+/// Adds a line to the file, which is written whole or not at all: another process may be reading, or adding one of its own.
 fn keep(folder: &Path, key: &str, word: &str) -> io::Result<()> {
+    fs::create_dir_all(folder)?;
+    let lock = fs::File::create(folder.join(LOCK))?;
+    // Where there are no locks, a line of another's may get lost, and is measured again.
+    let _ = lock.lock();
     let mut known = read(folder).unwrap_or_default();
     known.insert(key.to_owned(), word.to_owned());
     let lines: String = known.iter().map(|(key, label)| format!("{key} {label}\n")).collect();
     let nanoseconds = SystemTime::UNIX_EPOCH.elapsed().map_or(0, |time| time.as_nanos());
     let new = folder.join(format!("{FILE}.{}.{nanoseconds}", std::process::id()));
-    fs::create_dir_all(folder)?;
     fs::write(&new, lines)?;
     fs::rename(&new, folder.join(FILE)).inspect_err(|_| drop(fs::remove_file(&new)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn writers_at_once_lose_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |writer: usize| (0..20).for_each(|line| keep(folder.path(), &format!("{writer}-{line}"), "word").unwrap());
+        std::thread::scope(|scope| (0..4).for_each(|writer| drop(scope.spawn(move || write(writer)))));
+        assert_eq!(read(folder.path()).unwrap().len(), 80);
+    }
 }

@@ -1,4 +1,4 @@
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::fmt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -46,6 +46,9 @@ impl fmt::Display for AdapterInfo {
         write!(f, "{} ({}, {})", self.name, self.backend, self.driver)
     }
 }
+
+/// What translates kernels for the driver.
+const TRANSLATOR: &str = "naga 30.0.1";
 
 type Sources = dyn Fn(&Kernel, &Variant) -> String + Send + Sync;
 
@@ -113,7 +116,7 @@ impl Gpu {
         self.chooser.choice()
     }
 
-    /// What [`Gpu::remember`] was told last under this name of a device with this name, driver and kernels' texts, in this process or another;
+    /// What [`Gpu::remember`] was told last under this name of a device with this name, driver, features and kernels' texts, in this process or another;
     /// `None` where nothing is kept.
     pub fn remembered(&self, name: &str) -> Option<String> {
         self.chooser.remembered(&self.key(name))
@@ -127,7 +130,23 @@ impl Gpu {
     /// What a word about the whole device is kept under.
     fn key(&self, name: &str) -> String {
         let texts = TABLE.iter().flat_map(|kernel| kernel.variants.iter().map(|variant| self.source(kernel, variant)));
-        key(&format!("{} {name} {:?}", self.adapter(), texts.collect::<Vec<_>>()))
+        key(&format!("{} {name} {:?}", self.identity(), texts.collect::<Vec<_>>()))
+    }
+
+    /// Everything but a kernel's text that decides what the device computes, and how fast.
+    pub(crate) fn identity(&self) -> String {
+        let (info, features) = (self.device.adapter_info(), self.device.features());
+        format!("{} {TRANSLATOR} {features:?} {} {}", self.adapter(), info.subgroup_min_size, info.subgroup_max_size)
+    }
+
+    /// The forms of kernels beside the plain ones that this device may run, as endings for [`Choice::Named`].
+    pub fn forms(&self) -> BTreeSet<&'static str> {
+        let may_run = |variant: &&Variant| match variant.requires {
+            requires if requires.contains(&Requirement::CooperativeMatrices) => false,
+            requires => self.has_subgroups() || !requires.contains(&Requirement::Subgroups),
+        };
+        let others = TABLE.iter().flat_map(|kernel| kernel.variants.iter().skip(1)).filter(may_run);
+        others.filter_map(|variant| variant.name.rsplit('_').next()).collect()
     }
 
     pub(crate) fn chooser(&self) -> &Chooser {

@@ -5,7 +5,7 @@ use std::ops::Range;
 use srn_plan::Step;
 
 /// Most matrix work of one submission, so that no driver's watchdog takes it for a hang (20 GFLOP: a second on a slow device).
-const MOST_FLOPS: u64 = 20_000_000_000;
+pub(crate) const MOST_FLOPS: u64 = 20_000_000_000;
 /// Most steps of one submission. Two timestamps each fit a query set.
 pub(crate) const MOST_STEPS: usize = 2000;
 

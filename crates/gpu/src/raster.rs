@@ -76,8 +76,6 @@ pub enum RasterError {
 pub struct Rasterizer {
     gpu: Gpu,
     pipeline: wgpu::RenderPipeline,
-    camera: wgpu::Buffer,
-    camera_group: wgpu::BindGroup,
     sampler: wgpu::Sampler,
 }
 
@@ -141,17 +139,6 @@ impl Rasterizer {
             multiview_mask: None,
             cache: None,
         });
-        let camera = device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("raster camera"),
-            size: size_of::<CameraUniform>() as u64,
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        let camera_group = device.create_bind_group(&wgpu::BindGroupDescriptor {
-            label: Some("raster camera"),
-            layout: &pipeline.get_bind_group_layout(0),
-            entries: &[wgpu::BindGroupEntry { binding: 0, resource: camera.as_entire_binding() }],
-        });
         let sampler = device.create_sampler(&wgpu::SamplerDescriptor {
             label: Some("raster"),
             address_mode_u: wgpu::AddressMode::Repeat,
@@ -161,7 +148,7 @@ impl Rasterizer {
             mipmap_filter: wgpu::MipmapFilterMode::Linear,
             ..Default::default()
         });
-        Self { gpu: gpu.clone(), pipeline, camera, camera_group, sampler }
+        Self { gpu: gpu.clone(), pipeline, sampler }
     }
 
     /// Copies a mesh to the device.
@@ -230,7 +217,19 @@ impl Rasterizer {
                 usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC,
                 mapped_at_creation: false,
             });
-            self.gpu.queue().write_buffer(&self.camera, 0, bytemuck::bytes_of(&camera_uniform(view)));
+            // One for each picture: another thread may be drawing, too.
+            let camera = self.gpu.device().create_buffer(&wgpu::BufferDescriptor {
+                label: Some("raster camera"),
+                size: size_of::<CameraUniform>() as u64,
+                usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            });
+            let camera_group = self.gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
+                label: Some("raster camera"),
+                layout: &self.pipeline.get_bind_group_layout(0),
+                entries: &[wgpu::BindGroupEntry { binding: 0, resource: camera.as_entire_binding() }],
+            });
+            self.gpu.queue().write_buffer(&camera, 0, bytemuck::bytes_of(&camera_uniform(view)));
             let mut encoder = self.gpu.device().create_command_encoder(&Default::default());
             let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
                 label: Some("raster"),
@@ -248,7 +247,7 @@ impl Rasterizer {
                 ..Default::default()
             });
             pass.set_pipeline(&self.pipeline);
-            pass.set_bind_group(0, &self.camera_group, &[]);
+            pass.set_bind_group(0, &camera_group, &[]);
             pass.set_vertex_buffer(0, model.vertices.slice(..));
             for (range, texture) in &model.parts {
                 pass.set_bind_group(1, &model.textures[*texture], &[]);

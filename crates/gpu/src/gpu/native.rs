@@ -146,12 +146,15 @@ impl Gpu {
         let (device, queue) = pollster::block_on(request)
             .map_err(|error| OpenError::Refused { adapter: name.clone(), what: one_line(&error.to_string()) })?;
         let gpu = Gpu { cooperative, ..Gpu::from_device(device, queue) };
-        let shared = gpu.shared.clone();
+        // The device owns what it calls, and pipelines, which are shared, own the device: it would never be freed.
+        let shared = Arc::downgrade(&gpu.shared);
         gpu.device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            let Some(shared) = shared.upgrade() else { return };
             lock(&shared.uncaptured).get_or_insert(one_line(&error.to_string()));
         }));
-        let shared = gpu.shared.clone();
+        let shared = Arc::downgrade(&gpu.shared);
         gpu.device.set_device_lost_callback(move |reason, message| {
+            let Some(shared) = shared.upgrade() else { return };
             lock(&shared.lost).get_or_insert(format!("the device was lost ({reason:?}): {}", one_line(&message)));
         });
         Ok(gpu)
@@ -179,5 +182,25 @@ impl Gpu {
             Ok(Ok(())) => Ok(()),
             _ => Err("the device was lost, or the buffer cannot be mapped".into()),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use srn_shaders::SUM_FORWARD;
+
+    use super::*;
+
+    #[test]
+    fn a_device_is_freed_with_its_last_clone() {
+        let gpu = Gpu::open(std::env::var("SIGMA_SRN_ADAPTER").ok().as_deref()).unwrap();
+        gpu.pipeline(&SUM_FORWARD, &SUM_FORWARD.variants[0]).unwrap();
+        let (clone, shared) = (gpu.clone(), Arc::downgrade(&gpu.shared));
+        drop(gpu);
+        assert!(shared.upgrade().is_some());
+        drop(clone);
+        assert!(shared.upgrade().is_none());
     }
 }
