@@ -2,6 +2,7 @@
 
 use std::fs;
 
+use rayon::prelude::*;
 use sigma_srn::{Engine, Error, Gpu, Method, Model, Options, Outline, Phase, Query, Renderer, Train, Trainer, camera, estimate};
 use srn_gpu::Choice;
 use srn_tests::gpu;
@@ -89,6 +90,22 @@ fn plain_forms_replace_faster_ones_that_are_wrong() {
     let plain = Engine::gpu(gpu().with_choice(Choice::Named("plain".into())));
     assert_eq!(found(&engine).unwrap(), found(&plain).unwrap());
     trained(&engine, model(true), Train::Everything).unwrap();
+}
+
+#[test]
+fn forms_are_tried_that_the_trial_would_not_choose() {
+    // On a GPU that is this machine's processor it is never the fastest.
+    let engine = Engine::gpu(faulty(|label| label == "linear/forward_workgroup", does_nothing));
+    found(&engine).unwrap();
+    assert_eq!(engine.as_gpu().unwrap().choice(), &Choice::Named("plain".into()));
+}
+
+#[test]
+fn threads_that_wait_for_the_cpu_do_not_wait_for_each_other() {
+    let engine = Engine::gpu(gpu().with_choice(Choice::Measured { cache: None }));
+    // Each trial runs on the threads that the searches are on.
+    let poses: Vec<_> = (0..4).into_par_iter().map(|_| found(&engine).unwrap()).collect();
+    assert!(poses.iter().all(|pose| pose == &poses[0]), "{poses:?}");
 }
 
 #[test]

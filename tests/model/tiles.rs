@@ -91,6 +91,16 @@ fn a_budget_that_nothing_fits_is_an_error_with_both_numbers() {
 }
 
 #[test]
+fn the_budget_that_an_error_names_is_enough() {
+    // Many more rays than a plan has tiles.
+    let side = 512;
+    let rendered = |budget| Renderer::new(&Engine::cpu().with_budget(budget), &model(true), 1, side, side);
+    let Err(Error::Budget { needed, .. }) = rendered(1 << 20) else { panic!("fits into 1 MiB") };
+    assert!(rendered(needed).is_ok());
+    assert!(matches!(rendered(needed - 1), Err(Error::Budget { needed: again, .. }) if again == needed));
+}
+
+#[test]
 fn many_tiles_give_the_training_gradients_of_one() {
     const IMAGES: u32 = 5;
     for (engine, tolerance) in engines() {

@@ -14,17 +14,24 @@ pub struct Outline {
     pub dilation: f64,
     /// What is cut away on one side, a shadow that was taken for the object: where it is (columns, rows), and how wide.
     pub cut: DVec2,
+    /// Where a part of the object is missing, and how far from the mask on that side nothing is known (columns, rows).
+    pub missing: DVec2,
     /// How wide a cut is that explains a picture better, but not by so much that it is believed: it is not made, and what it would have changed is uncertain.
     pub undecided: f64,
 }
 
 impl Outline {
     /// As the mask is.
-    pub const AS_GIVEN: Outline = Outline { dilation: 0.0, cut: DVec2::ZERO, undecided: 0.0 };
+    pub const AS_GIVEN: Outline = Outline { dilation: 0.0, cut: DVec2::ZERO, missing: DVec2::ZERO, undecided: 0.0 };
 
     /// How far it is moved.
-    pub(crate) fn length(&self) -> f64 {
+    pub(crate) fn moved(&self) -> f64 {
         self.dilation.hypot(self.cut.length())
+    }
+
+    /// How far it is from as given.
+    pub(crate) fn length(&self) -> f64 {
+        self.moved().hypot(self.missing.length())
     }
 }
 
@@ -35,6 +42,7 @@ impl Add for Outline {
         Outline {
             dilation: self.dilation + other.dilation,
             cut: self.cut + other.cut,
+            missing: self.missing + other.missing,
             undecided: self.undecided + other.undecided,
         }
     }
@@ -45,7 +53,8 @@ impl Mul<f64> for Outline {
 
     /// In pixels that are so many times smaller.
     fn mul(self, times: f64) -> Self {
-        Outline { dilation: times * self.dilation, cut: times * self.cut, undecided: times * self.undecided }
+        let Outline { dilation, cut, missing, undecided } = self;
+        Outline { dilation: times * dilation, cut: times * cut, missing: times * missing, undecided: times * undecided }
     }
 }
 
@@ -67,10 +76,21 @@ const SIDES: [DVec2; 8] = [
     DVec2::new(FRAC_1_SQRT_2, -FRAC_1_SQRT_2),
 ];
 
+/// How far from a mask nothing may be known.
+pub(crate) const MISSING: f64 = 6.0;
+
 /// What is tried of a mask: the first is as given.
 pub(crate) fn outlines() -> impl Iterator<Item = Outline> {
     let dilations = DILATIONS.into_iter().map(|dilation| Outline { dilation, ..Outline::AS_GIVEN });
-    dilations.chain(SIDES.into_iter().map(|side| Outline { cut: CUT * side, ..Outline::AS_GIVEN }))
+    let cuts = SIDES.into_iter().map(|side| Outline { cut: CUT * side, ..Outline::AS_GIVEN });
+    dilations.chain(cuts).chain(SIDES.into_iter().map(|side| Outline { missing: MISSING * side, ..Outline::AS_GIVEN }))
+}
+
+/// Losses in the order of [`outlines`]: of dilations, of cuts, and of masks with something missing.
+fn by_kind(losses: &[f64]) -> [&[f64]; 3] {
+    let (dilated, others) = losses.split_at(DILATIONS.len());
+    let (cut, missing) = others.split_at(SIDES.len());
+    [dilated, cut, missing]
 }
 
 /// By which part of the loss a dilation must be better than the mask as given, for each pixel. At a pose that is wrong a mask that is wrong explains a
@@ -80,6 +100,8 @@ const BETTER: f64 = 0.15;
 /// Which part of the least loss that dilations leave, for each pixel, a cut must leave at most to be believed, and to be worth a closer look (`docs/accuracy.md`).
 const CUT_LEAVES: f64 = 0.72;
 const CUT_IS_WORTH: f64 = 1.4;
+/// The same of it, for something that is missing to be believed.
+const MISSING_LEAVES: f64 = 0.6;
 
 /// Directions in which a pixel looks around.
 const DIRECTIONS: usize = 16;
@@ -113,6 +135,16 @@ pub(crate) fn with_outline(
         (0..DIRECTIONS).map(move |k| dilation.abs() * ring as f64 / last * DVec2::from_angle(TAU * k as f64 / DIRECTIONS as f64))
     };
     moved(&rgb, &coverage, weights, width, &rings.flat_map(ring).collect::<Vec<_>>(), dilation > 0.0)
+}
+
+/// How much is known of each pixel where a part of the object is missing on one side of its mask: there it may be the object's or not. `coverage` and `weights
+/// [pixels]`, `width` pixels per row.
+pub(crate) fn known(coverage: &[f32], weights: Option<&[f32]>, width: usize, missing: DVec2) -> Vec<f32> {
+    let parts = (2.0 * missing.length()).ceil();
+    let back: Vec<DVec2> = (1..=parts as usize).map(|part| -(part as f64 / parts) * missing).collect();
+    // Whatever colour it has.
+    let (_, reached) = moved(&vec![1.0; 3 * coverage.len()], coverage, weights, width, &back, true);
+    zip(reached, coverage).map(|(reached, cover)| 1.0 - (reached - cover)).collect()
 }
 
 /// Each pixel takes the most, or the least, coverage of what lies at these offsets. Where the object grows, it has the colour of the place that it grows
@@ -180,7 +212,7 @@ pub(crate) const NARROW_CUTS: usize = 3;
 /// What is worth a closer look: where a cut leaves little more than the least that dilations do, narrower ones on its side and to either side of it; then the
 /// same cut again, a wider one, and the best dilation again beside which those are judged. `losses` are in the order of [`outlines`].
 pub(crate) fn closer_outlines(losses: &[f64]) -> Vec<Outline> {
-    let (dilated, cuts) = losses.split_at(DILATIONS.len());
+    let [dilated, cuts, _] = by_kind(losses);
     let least = |losses: &[f64]| (0..losses.len()).min_by(|&a, &b| losses[a].total_cmp(&losses[b])).unwrap_or_default();
     let (side, dilation) = (least(cuts), DILATIONS[least(dilated)]);
     if cuts[side].is_nan() || cuts[side] >= CUT_IS_WORTH * best_dilation(dilated).1 {
@@ -191,10 +223,11 @@ pub(crate) fn closer_outlines(losses: &[f64]) -> Vec<Outline> {
     narrow.into_iter().chain([cut(CUT, 0), cut(WIDEST_CUT, 0), Outline { dilation, ..Outline::AS_GIVEN }]).collect()
 }
 
-/// What leaves the least loss: a cut, if that is much less than what dilations leave, else a dilation; none, if the mask is not that much worse as given.
+/// What leaves the least loss: a cut, or something missing, if that is much less than what dilations leave, else a dilation; none, if the mask is not that
+/// much worse as given.
 /// `losses` are in the order of [`outlines`], `closer` in that of [`closer_outlines`].
 pub(crate) fn best_outline(losses: &[f64], closer: &[f64]) -> Outline {
-    let (dilated, cut) = losses.split_at(DILATIONS.len());
+    let [dilated, cut, missing] = by_kind(losses);
     let (dilation, least) = best_dilation(dilated);
     let is_better = least < (1.0 - BETTER * dilation.abs()) * losses[0];
     let dilation = Outline { dilation: if is_better { dilation } else { 0.0 }, ..Outline::AS_GIVEN };
@@ -204,9 +237,13 @@ pub(crate) fn best_outline(losses: &[f64], closer: &[f64]) -> Outline {
     let of_closer = |(number, (cut, loss))| (cut, loss / if number < NARROW_CUTS { least } else { again * least });
     let cuts =
         tried.chain(zip(closer_outlines(losses), closer).enumerate().map(of_closer)).filter(|(cut, _)| cut.cut != DVec2::ZERO);
-    match cuts.min_by(|a, b| a.1.total_cmp(&b.1)) {
-        Some((cut, leaves)) if leaves < CUT_LEAVES => cut,
-        Some((cut, leaves)) if leaves < 1.0 => Outline { undecided: cut.cut.length(), ..dilation },
+    let cut = cuts.min_by(|a, b| a.1.total_cmp(&b.1));
+    let missing = zip(outlines().skip(DILATIONS.len() + SIDES.len()), missing).map(|(missing, loss)| (missing, loss / least));
+    let missing = missing.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, leaves)| *leaves < MISSING_LEAVES);
+    match (cut, missing) {
+        (cut, Some((missing, leaves))) if cut.is_none_or(|(_, left)| leaves / MISSING_LEAVES < left / CUT_LEAVES) => missing,
+        (Some((cut, leaves)), _) if leaves < CUT_LEAVES => cut,
+        (Some((cut, leaves)), _) if leaves < 1.0 => Outline { undecided: cut.cut.length(), ..dilation },
         _ => dilation,
     }
 }
@@ -297,6 +334,54 @@ mod tests {
     }
 
     #[test]
+    fn what_may_be_missing_is_not_known() {
+        // The lower part of a disc is missing, from the middle of a row on.
+        let (rgb, whole) = disc(3.2);
+        let left = |pixel: usize| [1.0, 0.5, 0.0][(pixel / WIDTH).saturating_sub(6).min(2)];
+        let coverage: Vec<f32> = whole.iter().enumerate().map(|(pixel, cover)| cover * left(pixel)).collect();
+        let known = |weights: Option<&[f32]>, by: f64| known(&coverage, weights, WIDTH, DVec2::new(0.0, by));
+        // All that it lacks, and nothing of itself.
+        for (k, (known, (cover, whole))) in zip(known(None, 3.0), zip(&coverage, &whole)).enumerate() {
+            assert!(known <= 1.0 - (whole - cover) + 1e-5 && known >= *cover - 1e-5, "{k}: {known} of {cover}, {whole}");
+        }
+        // No farther than that, and nothing on other sides.
+        let unknown = |by: f64| known(None, by).iter().map(|known| 1.0 - known).sum::<f32>();
+        assert!(
+            (unknown(3.0) / 6.4 - 3.0).abs() < 0.4 && (unknown(1.0) / 6.4 - 1.0).abs() < 0.2,
+            "{} {}",
+            unknown(3.0),
+            unknown(1.0)
+        );
+        assert!(known(None, 3.0)[..4 * WIDTH].iter().all(|known| *known == 1.0));
+        // What does not count says nothing of where the object ends.
+        let weights: Vec<f32> = (0..WIDTH * WIDTH).map(|pixel| if pixel < 8 * WIDTH { 0.0 } else { 1.0 }).collect();
+        assert!(super::known(&coverage, Some(&weights), WIDTH, DVec2::new(0.0, 3.0)).iter().all(|known| *known == 1.0));
+        assert_eq!(rgb.len(), 3 * coverage.len());
+    }
+
+    #[test]
+    fn what_is_missing_must_leave_much_less_than_dilations() {
+        let number = DILATIONS.len() + SIDES.len() + 2;
+        let below = outlines().nth(number).unwrap();
+        assert_eq!((below.missing, outlines().count()), (DVec2::new(0.0, MISSING), number + 6));
+        let losses = |dilated: f64, cut: f64, missing: f64| {
+            let of = |outline: Outline| match outline {
+                Outline { dilation: -2.0, .. } => dilated,
+                outline if outline == below => missing,
+                outline if outline.cut == DVec2::new(0.0, -CUT) => cut,
+                outline => 1.0 + outline.length(),
+            };
+            best_outline(&outlines().map(of).collect::<Vec<_>>(), &[])
+        };
+        let dilated = Outline { dilation: -2.0, ..Outline::AS_GIVEN };
+        assert_eq!([losses(1.0, 1.1, 0.61), losses(1.0, 1.1, 0.59)], [Outline::AS_GIVEN, below]);
+        assert_eq!([losses(0.5, 1.1, 0.31), losses(0.5, 1.1, 0.29)], [dilated, below]);
+        // Beside a cut the one that is beyond what it must be by more.
+        let cut = Outline { cut: DVec2::new(0.0, -CUT), ..Outline::AS_GIVEN };
+        assert_eq!([losses(1.0, 0.5, 0.43), losses(1.0, 0.5, 0.41)], [cut, below]);
+    }
+
+    #[test]
     fn a_cut_must_leave_much_less_than_dilations() {
         // A quarter of the way around.
         let below = outlines().nth(DILATIONS.len() + 2).unwrap();
@@ -305,7 +390,7 @@ mod tests {
             let of = |outline: Outline| match outline {
                 Outline { dilation: -2.0, .. } => dilated,
                 outline if outline == below => cut,
-                outline => 1.0 + outline.cut.length(),
+                outline => 1.0 + outline.cut.length() + outline.missing.length(),
             };
             outlines().map(of).collect::<Vec<_>>()
         };
@@ -315,7 +400,7 @@ mod tests {
         assert_eq!([best(1.0, 1.1), best(1.0, 0.9)], [Outline::AS_GIVEN, undecided(Outline::AS_GIVEN, 3.0)]);
         assert_eq!([best(1.0, 0.73), best(1.0, 0.71)], [undecided(Outline::AS_GIVEN, 3.0), below]);
         assert_eq!([best(0.5, 0.37), best(0.5, 0.35)], [undecided(dilated, 3.0), below]);
-        assert_eq!([f64::INFINITY, f64::NAN].map(|loss| best_outline(&[loss; 13], &[])), [Outline::AS_GIVEN; 2]);
+        assert_eq!([f64::INFINITY, f64::NAN].map(|loss| best_outline(&[loss; 21], &[])), [Outline::AS_GIVEN; 2]);
 
         // A closer look finds a narrower one on the same side, or beside it.
         let closer = closer_outlines(&losses(1.0, 1.3));
@@ -323,7 +408,7 @@ mod tests {
         let cuts = [(0.0, y), (-x, x), (x, x), (0.0, 3.0), (0.0, 4.5), (0.0, 0.0)].map(|(x, y)| DVec2::new(x, y));
         assert!(closer.len() == 6 && zip(&closer, cuts).all(|(outline, cut)| outline.cut.abs_diff_eq(cut, 1e-12)), "{closer:?}");
         assert_eq!(closer_outlines(&losses(0.5, 0.6))[5], dilated);
-        assert_eq!((closer_outlines(&losses(0.9, 1.3)), closer_outlines(&[f64::NAN; 13])), (vec![], vec![]));
+        assert_eq!((closer_outlines(&losses(0.9, 1.3)), closer_outlines(&[f64::NAN; 21])), (vec![], vec![]));
         let best = |closer: [f64; 6]| best_outline(&losses(1.0, 1.3), &closer);
         assert_eq!(best([1.0, 0.7, 0.8, 1.0, 1.0, 1.0]), closer[1]);
         assert_eq!(best([1.0, 0.8, 1.2, 1.0, 1.0, 1.0]), undecided(Outline::AS_GIVEN, closer[1].cut.length()));
@@ -363,7 +448,7 @@ mod tests {
     fn the_best_dilation_lies_between_those_tried() {
         let losses = |least: f64, depth: f64| DILATIONS.map(|by| 1.0 + depth * (by - least) * (by - least));
         // With cuts that are worth nothing.
-        let best = |dilated: [f64; 5]| best_outline(&[&dilated[..], &[f64::INFINITY; 8]].concat(), &[]).dilation;
+        let best = |dilated: [f64; 5]| best_outline(&[&dilated[..], &[f64::INFINITY; 16]].concat(), &[]).dilation;
         for least in [-1.4, -0.7, 0.8, 1.3] {
             assert!((best(losses(least, 0.5)) - least).abs() < 1e-9, "{least}");
         }
@@ -373,7 +458,7 @@ mod tests {
         assert_eq!([best(losses(0.2, 0.5)), best(losses(1.3, 0.1))], [0.0; 2]);
         assert_eq!(best([f64::INFINITY; 5]), 0.0);
         // An exact mask, beside which no other leaves anything like as little.
-        let exact = [[1e-3, 1.0, 0.6, 2.0, 1.5].as_slice(), &[0.9; 8]].concat();
+        let exact = [[1e-3, 1.0, 0.6, 2.0, 1.5].as_slice(), &[0.9; 16]].concat();
         assert_eq!((best_outline(&exact, &[]).cut, closer_outlines(&exact)), (DVec2::ZERO, vec![]));
         assert_eq!(best([1.0, 0.5, f64::INFINITY, f64::INFINITY, 2.0]), -1.0);
         assert_eq!(best([f64::NAN, 0.5, 1.0, 1.0, 2.0]), 0.0);

@@ -77,7 +77,7 @@ impl Renderer {
             }
         }
         let work = if model.layout.is_baked() { "views of baked objects" } else { "views" };
-        engine.prove(work, |engine| {
+        engine.prove(work, model, |engine| {
             const TRIED: usize = 3;
             let (side, middle) = (proof::SIDE, f64::from(proof::SIDE) / 2.0);
             let intrinsics = Intrinsics { fx: f64::from(side), fy: f64::from(side), cx: middle, cy: middle, pixel_center: 0.0 };

@@ -171,12 +171,12 @@ impl Search {
         seconds: f64,
         doubt: impl FnOnce(&Estimate, f64) -> Option<Doubt>,
     ) -> Found {
-        let unexplained = unexplained(&estimate.target, query.weights.as_deref(), &view);
+        let unexplained = unexplained(&estimate.target, estimate.weights.as_deref(), &view);
         let doubt = match self.accept {
             Some(_) if !estimate.loss.is_finite() => Some(Doubt::Loss),
             Some(most) => unexplained_doubt(unexplained, most),
             None => {
-                doubt(&estimate, unexplained).or_else(|| hidden_doubt(query.weights.as_deref()?, &view, query.width as usize))
+                doubt(&estimate, unexplained).or_else(|| hidden_doubt(estimate.weights.as_deref()?, &view, query.width as usize))
             }
         };
         let confidence = Confidence::of(model, query.instance, &estimate);

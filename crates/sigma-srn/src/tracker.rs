@@ -4,7 +4,7 @@ use glam::DMat4;
 
 use crate::confidence::Doubt;
 use crate::estimator::{Options, Phase, Progress, Query};
-use crate::mask::{Outline, WIDEST_CUT};
+use crate::mask::{MISSING, Outline, WIDEST_CUT};
 use crate::search::{Found, Search};
 use crate::{Engine, Error, Model};
 
@@ -55,8 +55,12 @@ impl Tracker {
         let (engine, model) = (&self.engine, &self.model);
         let focal = frame.intrinsics.fx;
         let rim = self.rim.unwrap_or_default() * focal;
-        let (dilation, cut) = (rim.dilation.clamp(-WIDEST_RIM, WIDEST_RIM), rim.cut.clamp_length_max(WIDEST_CUT));
-        let outline = Outline { dilation, cut, ..rim };
+        let outline = Outline {
+            dilation: rim.dilation.clamp(-WIDEST_RIM, WIDEST_RIM),
+            cut: rim.cut.clamp_length_max(WIDEST_CUT),
+            missing: rim.missing.clamp_length_max(MISSING),
+            ..rim
+        };
         let frame = Query { instance: self.number, outline, ..frame };
         let near = match self.before[..] {
             [] => None,

@@ -129,7 +129,7 @@ impl Trainer {
         }
         model.hypernetwork()?;
         let work = if train == Train::Codes { "gradients of codes" } else { "gradients of all parameters" };
-        engine.prove(work, |engine| {
+        engine.prove(work, &model, |engine| {
             let mut trainer = Self::unproven(engine, model.clone(), train, 1, proof::SIDE * proof::SIDE)?;
             let few = |(_, values): (String, Vec<f32>)| {
                 let every = values.len().div_ceil(PROOF_VALUES).max(1);

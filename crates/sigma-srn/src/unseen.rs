@@ -85,7 +85,8 @@ fn fit_codes(engine: &Engine, model: Model, query: &Query, poses: &[DMat4], seed
     let mut rays = Rays::default();
     poses.iter().for_each(|pose| rays.push(pose, &query.intrinsics, pixels.iter().copied(), &mut random));
     let (instances, target_rgb) = ((0..poses.len() as u32).collect(), colours.repeat(poses.len()));
-    let batch = TrainingBatch { instances, rays, target_rgb, weights: Some(query.ray_weights(2).repeat(poses.len())) };
+    let weights = query.seen(query.outline).ray_weights(query.pixels(2)).repeat(poses.len());
+    let batch = TrainingBatch { instances, rays, target_rgb, weights: Some(weights) };
     for _ in 0..CODE_STEPS {
         trainer.step(&batch, LEARNING_RATE)?;
     }

@@ -97,7 +97,7 @@ impl Estimate {
         // The views that a calibration is from have no masks. An object whose outline is taken to be farther out seems larger, and nearer.
         let mut covariance = mixed.map(|row| row.map(|entry| CUT_OUT * size * entry));
         let radius = 0.5 * self.extent * f64::from(self.width);
-        covariance[5][5] += (self.pose.distance() * OUTLINE.hypot(OF_MOVED * outline.length()) / radius).powi(2);
+        covariance[5][5] += (self.pose.distance() * OUTLINE.hypot(OF_MOVED * outline.moved()) / radius).powi(2);
         // Were as much on one side no part of the object, its middle would be half as far to the other, it as much smaller, and turned as such a shift looks.
         let part = 0.5 * outline.undecided / radius;
         for (k, size) in [1.0, 1.0, 1.0, 0.5, 0.5, self.pose.distance()].into_iter().enumerate() {

@@ -78,6 +78,7 @@ mod tests {
             outline: None,
             is_without_outline: false,
             target: vec![],
+            weights: None,
             width: 64,
             extent: 0.5,
             ranking,

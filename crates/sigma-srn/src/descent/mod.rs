@@ -122,6 +122,13 @@ impl Descent {
         if gmsd && (width < 2 || height < 2) {
             return Err(Error::Setting { field: "loss", what: format!("GMSD needs 2 × 2 pixels, got {width} × {height}") });
         }
+        if let Method::Bfgs { soft, grain } = method {
+            let is_length = |value: f32| (0.0..f32::INFINITY).contains(&value);
+            if !(is_length(soft) && soft > 0.0 && is_length(grain)) {
+                let what = format!("BFGS needs soft above 0 and a grain of at least 0, both finite, got {soft} and {grain}");
+                return Err(Error::Setting { field: "method", what });
+            }
+        }
         let rows = hypotheses * width * height;
         let on_host = OnHost::of(engine, model, 1);
         let (plan, mut handles) = engine

@@ -20,6 +20,9 @@ const GPU_TILE_ROWS: u32 = 32_768;
 /// The same for a software adapter.
 const SOFTWARE_TILE_ROWS: u32 = 4096;
 
+/// Most tiles of a plan, which has some hundred steps for each: they take memory that no budget counts.
+const MOST_TILES: u32 = 1024;
+
 /// Rows of a sum, which are a loop of one invocation.
 const GPU_PART_ROWS: u32 = 512;
 
@@ -143,7 +146,7 @@ impl Engine {
     }
 
     /// Builds a plan with the largest tiles that fit the budget and the device's limits, for a network of `features`
-    /// wide layers; `build` gets the rows of a tile.
+    /// wide layers; `build` gets the rows of a tile. Where nothing fits, the error says what the smallest tiles need that are still few enough.
     pub(crate) fn fit<T>(
         &self,
         rows: u32,
@@ -156,21 +159,36 @@ impl Engine {
             // What is kept for the way back stays in the caches.
             Kind::Cpu(_) => srn_cpu::rows_for_all_threads(features as usize) as u32,
         });
-        let mut tile_rows = rows.min(preferred).max(1);
-        loop {
+        let least = rows.div_ceil(MOST_TILES).max(1);
+        // A plan with tiles of so many rows, or what it needs where that is too much.
+        let attempt = |tile_rows: u32| {
             let mut builder = self.builder();
-            let built = build(&mut builder, tile_rows).and_then(|rest| Ok((builder.finish()?, rest)));
-            let needed = match built {
-                Ok((plan, rest)) if self.bytes(&plan) <= self.budget => return Ok((plan, rest)),
-                Ok((plan, _)) => self.bytes(&plan),
-                Err(PlanError::TooLarge { .. }) if tile_rows > 1 => u64::MAX,
-                Err(error) => return Err(error.into()),
-            };
-            if tile_rows == 1 {
-                return Err(Error::Budget { budget: self.budget, needed });
+            match build(&mut builder, tile_rows).and_then(|rest| Ok((builder.finish()?, rest))) {
+                Ok((plan, rest)) if self.bytes(&plan) <= self.budget => Ok(Ok((plan, rest))),
+                Ok((plan, _)) => Ok(Err(self.bytes(&plan))),
+                Err(PlanError::TooLarge { .. }) if tile_rows > least => Ok(Err(u64::MAX)),
+                Err(error) => Err(Error::from(error)),
             }
-            tile_rows = (tile_rows * 3 / 4).max(1);
+        };
+        let mut tile_rows = rows.min(preferred).max(least);
+        let needed = match attempt(tile_rows)? {
+            Ok(built) => return Ok(built),
+            Err(needed) => needed,
+        };
+        // The smallest tiles say at once whether any fit, and how much a row takes.
+        let smallest = match attempt(least)? {
+            Ok(built) => built,
+            Err(needed) => return Err(Error::Budget { budget: self.budget, needed }),
+        };
+        let (left, taken) = (self.budget - self.bytes(&smallest.0), needed - self.bytes(&smallest.0));
+        tile_rows = least + (f64::from(tile_rows - least) * left as f64 / taken as f64) as u32;
+        while tile_rows > least {
+            if let Ok(built) = attempt(tile_rows)? {
+                return Ok(built);
+            }
+            tile_rows = (tile_rows * 3 / 4).max(least);
         }
+        Ok(smallest)
     }
 
     /// Rows of a tile of `tile_rows` over which one sum for the gradients of weights goes, at most, for a network of `features` wide layers.

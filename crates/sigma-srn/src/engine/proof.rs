@@ -11,7 +11,7 @@ use srn_cpu::Precision;
 use srn_gpu::{Choice, Gpu};
 
 use super::{Engine, Kind};
-use crate::Error;
+use crate::{Error, Model};
 
 /// Most difference from the CPU executor's results, relative to the largest, in the median of the trials: in one of twenty a single ray makes rounding as
 /// large as a hundredth; a wrong kernel is wrong in all.
@@ -23,6 +23,9 @@ const SMALL: f64 = 1e-3;
 /// Most rays to a side of the pictures of a trial: the CPU has to do the same.
 pub(crate) const SIDE: u32 = 16;
 
+/// Most width of a network that a software adapter is tried with in all forms of kernels; with wider ones, some take it seconds.
+const SOFTWARE_WIDTH: u32 = 16;
+
 /// What is remembered of a device: all forms of kernels are right, or the plain ones alone.
 const AGREES: &str = "agrees";
 const AGREES_PLAIN: &str = "agrees/plain";
@@ -33,29 +36,40 @@ pub(crate) type Trial = Vec<Vec<f64>>;
 /// What was found of a GPU.
 #[derive(Debug, Default)]
 pub(super) struct Proofs {
-    /// Kinds of work that it does as the CPU does.
-    works: Vec<&'static str>,
+    /// Kinds of work, and widths of networks, that it does as the CPU does.
+    works: Vec<(&'static str, u32)>,
     /// What computes in its place: the same device with the plain forms of kernels, if others are wrong, or the CPU.
     pub instead: Option<Kind>,
 }
 
 impl Engine {
-    /// Compares some trials of a kind of work with the CPU executor's. Where only the plain forms of kernels agree the engine goes on with those; where
-    /// they do not, it fails, or goes on with the CPU ([`Engine::or_cpu`]). Done once for a device, its driver and the kernels' texts: the answer is kept where choices of variants are.
+    /// Compares some trials of a kind of work, for networks as wide as the model's, with the CPU executor's. Where only the plain forms of kernels agree the
+    /// engine goes on with those; where they do not, it fails, or goes on with the CPU ([`Engine::or_cpu`]). Done once for a device, its driver and the kernels'
+    /// texts: the answer is kept where choices of variants are.
     ///
-    /// Not where forms are [named](Choice::Named): whoever names one wants to see what it does.
-    pub(crate) fn prove(&self, work: &'static str, trials: impl Fn(&Engine) -> Result<Vec<Trial>, Error>) -> Result<(), Error> {
+    /// Tried are the forms that are fastest for a trial, and each other one in turn, for larger work may choose those. Not where forms are
+    /// [named](Choice::Named): whoever names one wants to see what it does.
+    pub(crate) fn prove(
+        &self,
+        work: &'static str,
+        model: &Model,
+        trials: impl Fn(&Engine) -> Result<Vec<Trial>, Error>,
+    ) -> Result<(), Error> {
         let Kind::Gpu(gpu) = &self.kind else { return Ok(()) };
         if matches!(gpu.choice(), Choice::Named(_)) {
             return Ok(());
         }
-        // Held to the end: who comes meanwhile waits for the answer.
-        let mut proofs = self.proofs.lock().unwrap_or_else(PoisonError::into_inner);
-        if proofs.works.contains(&work) || matches!(proofs.instead, Some(Kind::Cpu(_))) {
+        let width = model.layout.features();
+        // Not held while trials run: the CPU executor's threads may take up work of the caller's meanwhile that asks, too. Two may find the same answer.
+        let proofs = || self.proofs.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_known = |proofs: &Proofs| proofs.works.contains(&(work, width)) || matches!(proofs.instead, Some(Kind::Cpu(_)));
+        if is_known(&proofs()) {
             return Ok(());
         }
-        let plain = gpu.with_choice(Choice::Named("plain".into())).without_cooperative();
-        let is_plain = match gpu.remembered(work).as_deref() {
+        let named = |form: &str| gpu.with_choice(Choice::Named(form.into())).without_cooperative();
+        let plain = named("plain");
+        let kept = format!("{work}, {width} wide");
+        let is_plain = match gpu.remembered(&kept).as_deref() {
             Some(AGREES) => false,
             Some(AGREES_PLAIN) => true,
             _ => {
@@ -66,28 +80,34 @@ impl Engine {
                     return Ok(());
                 }
                 let off = |gpu: &Gpu| by(Engine::gpu(gpu.clone())).map(|found| median(zip(&found, &expected)));
-                let fast = off(&gpu.without_cooperative())?;
+                let mut fast = off(&gpu.without_cooperative())?;
+                if !gpu.adapter().is_software || width <= SOFTWARE_WIDTH {
+                    for form in gpu.forms() {
+                        fast = fast.max(off(&named(form))?);
+                    }
+                }
                 tracing::debug!(work, "the GPU's results differ from the CPU executor's by {fast:.1e} of the largest");
                 if fast > LIMIT {
                     let difference = off(&plain)?;
                     if difference > LIMIT && self.or_cpu {
                         tracing::warn!("{} computes wrong results, so the CPU does", gpu.adapter());
-                        proofs.instead = Some(Kind::Cpu(Precision::F32));
+                        proofs().instead = Some(Kind::Cpu(Precision::F32));
                         return Ok(());
                     }
                     if difference > LIMIT {
                         return Err(Error::Adapter { adapter: gpu.adapter().to_string(), work, difference });
                     }
                 }
-                gpu.remember(work, if fast > LIMIT { AGREES_PLAIN } else { AGREES });
+                gpu.remember(&kept, if fast > LIMIT { AGREES_PLAIN } else { AGREES });
                 fast > LIMIT
             }
         };
+        let mut proofs = proofs();
         if is_plain && proofs.instead.is_none() {
             tracing::warn!("{} computes wrong results with the fast forms of kernels; the plain ones are used", gpu.adapter());
             proofs.instead = Some(Kind::Gpu(plain));
         }
-        proofs.works.push(work);
+        proofs.works.push((work, width));
         Ok(())
     }
 }

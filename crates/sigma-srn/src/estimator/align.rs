@@ -44,7 +44,7 @@ pub(super) fn align(
     let mut either: Vec<(usize, [Pose6; 2])> = Vec::new();
     for (k, (rgb, render)) in zip(targets.rgb.chunks(values), renders.chunks(values)).enumerate() {
         let (query, start) = (&queries[running[k].query], running[k].pose.to_matrix());
-        let weights = query.ray_weights(phase.stride);
+        let weights = query.seen(running[k].outline).ray_weights(query.pixels(phase.stride));
         let shown = |rgb: &[f32], weights: &[f32]| Shown::of(rgb, weights, query.rays(phase.stride));
         let aligned = |wanted: Shown, now: &Shown| Pose6::from_matrix(&wanted.seen_by(now, &start, &query.intrinsics));
         let (Some(wanted), Some(in_sight)) = (shown(rgb, &weights), shown(render, &weights)) else { continue };

@@ -6,7 +6,7 @@ mod query;
 mod targets;
 
 use std::borrow::Cow;
-use std::iter::zip;
+use std::iter::{self, zip};
 
 use glam::DMat4;
 use serde::Serialize;
@@ -76,6 +76,8 @@ pub struct Estimate {
     pub is_without_outline: bool,
     /// The image as it was compared at the end, with this outline and in the model's light `[height, width, 3]`.
     pub target: Vec<f32>,
+    /// How much each pixel of it counted then `[height, width]`: not at all where a part of the object may be missing in the mask. `None`: all the same.
+    pub weights: Option<Vec<f32>>,
     /// Pixels per row of it.
     pub width: u32,
     /// How long the object's diagonal is in the picture, as a part of the picture's width.
@@ -178,14 +180,19 @@ fn prove(engine: &Engine, model: &Model, queries: &[Query], options: &Options, h
         descent.gradients()
     };
     let work = if model.layout.is_baked() { "gradients of poses of baked objects" } else { "gradients of poses" };
-    engine.prove(work, |engine| {
+    engine.prove(work, model, |engine| {
         // As many of them from one start alone.
         let around = |h: &Hypothesis| {
             let at = |matrix: DMat4| Hypothesis { pose: Pose6::from_matrix(&matrix), ..*h };
             turned(&h.pose.to_matrix()).map(at).collect::<Vec<_>>()
         };
         let tried: Vec<Hypothesis> = hypotheses.iter().copied().chain(hypotheses.iter().flat_map(around)).take(TRIED).collect();
-        let stride = if options.is_gmsd() { 1 } else { queries[0].width.max(queries[0].height).div_ceil(proof::SIDE) };
+        // The phases' rays are known to see something.
+        let coarsest = options.phases.iter().map(|phase| phase.stride).max().unwrap_or(1);
+        let longest = if options.is_gmsd() { 1 } else { queries[0].width.max(queries[0].height) };
+        let finer = iter::successors(Some(longest.div_ceil(proof::SIDE)), |stride| Some(stride / 2));
+        let all_see = |stride: &u32| *stride <= coarsest || tried.iter().all(|h| queries[h.query].sees(*stride));
+        let stride = finer.take_while(|stride| *stride > 0).find(all_see).unwrap_or(1);
         Ok(gradients_of(engine, &tried, stride)?.iter().map(|six| vec![six.to_vec()]).collect())
     })?;
     let tried = &hypotheses[..hypotheses.len().min(TRIED)];
@@ -292,7 +299,7 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
     }
 
     fn per_area(&self, h: &Hypothesis) -> f64 {
-        h.loss / self.queries[h.query].area(h.outline)
+        h.loss / self.queries[h.query].seen(h.outline).area()
     }
 
     /// The best start of each query with the outlines that are worth a closer look, as it has `entered`, or where the nearest outline has led it.
@@ -343,16 +350,16 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         let &Hypothesis { pose, loss, curvature, .. } = own[0];
         let (light, outline, of_query) = (self.lights[query], self.outlines[query], query);
         let query = &self.queries[query];
-        let (rgb, coverage) = query.seen(self.outline(of_query));
-        let mut target = rgb.into_owned();
+        let seen = query.seen(self.outline(of_query));
+        let (mut target, weights) = (seen.rgb.into_owned(), seen.weights.map(Cow::into_owned));
         if let Some(light) = light {
-            light.undo(&mut target, &coverage);
+            light.undo(&mut target, &seen.coverage);
         }
         let width = query.width;
         let extent = query.intrinsics.fx / (pose.distance() * f64::from(width));
         let ranking = own.iter().map(ranked).collect();
         let is_without_outline = query.coverage.is_some() && !query.has_outline();
-        Estimate { pose, loss, curvature, light, outline, is_without_outline, target, width, extent, ranking }
+        Estimate { pose, loss, curvature, light, outline, is_without_outline, target, weights, width, extent, ranking }
     }
 
     /// Takes hypotheses through a phase, those of a query one after the other, the best first. What second derivatives say at its end is found out where

@@ -1,13 +1,14 @@
 //! What is wanted: an image with what is known of it, and where the search for its pose starts.
 
 use std::borrow::Cow;
+use std::iter::zip;
 
 use glam::{DMat4, DVec2};
 
 use super::align::hidden_side;
 use super::options::{Options, Phase};
 use crate::camera::Intrinsics;
-use crate::mask::{Outline, has_outline, outlines, with_outline};
+use crate::mask::{Outline, has_outline, known, outlines, with_outline};
 use crate::model::Model;
 use crate::pixel_grid;
 
@@ -51,32 +52,29 @@ impl Query {
         self.rays(stride).map(move |(u, v)| (v * width + u) as usize)
     }
 
-    fn weight(&self, pixel: usize) -> f32 {
-        self.weights.as_ref().map_or(1.0, |weights| weights[pixel])
-    }
-
-    /// Weights of the rays, scaled to a mean of 1: losses of pictures with masks and without are then of one kind.
-    pub(crate) fn ray_weights(&self, stride: u32) -> Vec<f32> {
-        let weights: Vec<f32> = self.pixels(stride).map(|pixel| self.weight(pixel)).collect();
-        let mean = weights.iter().sum::<f32>() / weights.len() as f32;
-        weights.into_iter().map(|weight| weight / mean).collect()
-    }
-
-    /// Colours, and how much the object covers (none where that is not known), with the mask made right.
-    pub(crate) fn seen(&self, outline: Outline) -> (Cow<'_, [f32]>, Cow<'_, [f32]>) {
-        match &self.coverage {
-            Some(coverage) if outline != Outline::AS_GIVEN => {
-                let (rgb, coverage) = with_outline(&self.rgb, coverage, self.weights.as_deref(), self.width as usize, outline);
-                (rgb.into(), coverage.into())
+    /// The image with its mask made right.
+    pub(crate) fn seen(&self, outline: Outline) -> Seen<'_> {
+        let Query { rgb, coverage, weights, width, .. } = self;
+        let (width, weights) = (*width as usize, weights.as_deref());
+        let Some(coverage) = coverage.as_deref().filter(|_| outline != Outline::AS_GIVEN) else {
+            let coverage = coverage.as_deref().unwrap_or_default();
+            return Seen { rgb: rgb.into(), coverage: coverage.into(), weights: weights.map(Cow::from) };
+        };
+        let (rgb, coverage) = with_outline(rgb, coverage, weights, width, outline);
+        let weights = match outline.missing {
+            DVec2::ZERO => weights.map(Cow::from),
+            missing => {
+                let mut known = known(&coverage, weights, width, missing);
+                zip(&mut known, weights.into_iter().flatten()).for_each(|(known, weight)| *known *= weight);
+                Some(known.into())
             }
-            coverage => (self.rgb.as_slice().into(), coverage.as_deref().unwrap_or_default().into()),
-        }
+        };
+        Seen { rgb: rgb.into(), coverage: coverage.into(), weights }
     }
 
-    /// How many of the pixels that count the object covers with its mask made right.
-    pub(crate) fn area(&self, outline: Outline) -> f64 {
-        let (_, coverage) = self.seen(outline);
-        coverage.iter().enumerate().map(|(pixel, cover)| f64::from(cover * self.weight(pixel))).sum()
+    /// Whether rays of this stride see a pixel that counts.
+    pub(crate) fn sees(&self, stride: u32) -> bool {
+        self.pixels(stride).any(|pixel| self.weights.as_ref().is_none_or(|weights| weights[pixel] > 0.0))
     }
 
     /// Whether the mask has an outline that may be wrong.
@@ -128,19 +126,49 @@ impl Query {
             return Err(format!("needs a coverage of {pixels} values from 0 to 1"));
         }
         let side = f64::from(width.max(height));
-        let Outline { dilation, cut, undecided } = self.outline;
-        if let Some(by) = [dilation, cut.x, cut.y, undecided].into_iter().find(|by| by.is_nan() || by.abs() > side) {
+        let Outline { dilation, cut, missing, undecided } = self.outline;
+        if let Some(by) =
+            [dilation, cut.x, cut.y, missing.x, missing.y, undecided].into_iter().find(|by| by.is_nan() || by.abs() > side)
+        {
             return Err(format!("a mask whose outline is {by} pixels off, where the image has {side}"));
         }
         if let Some(weights) = &self.weights {
             if weights.len() != pixels || weights.iter().any(|weight| !(0.0..f32::INFINITY).contains(weight)) {
                 return Err(format!("needs {pixels} weights of 0 or more, finite"));
             }
-            if options.phases.iter().any(|phase| self.ray_weights(phase.stride).iter().any(|weight| !weight.is_finite())) {
+            if options.phases.iter().any(|phase| !self.sees(phase.stride)) {
                 return Err("too few pixels count: a phase of the search sees none of them".into());
             }
         }
         Ok(())
+    }
+}
+
+/// An image as it is compared: with its mask made right.
+pub(crate) struct Seen<'a> {
+    /// Colours, see [`Query::rgb`].
+    pub rgb: Cow<'a, [f32]>,
+    /// How much the object covers, see [`Query::coverage`]; empty where that is not known.
+    pub coverage: Cow<'a, [f32]>,
+    /// How much each pixel counts, see [`Query::weights`].
+    pub weights: Option<Cow<'a, [f32]>>,
+}
+
+impl Seen<'_> {
+    fn weight(&self, pixel: usize) -> f32 {
+        self.weights.as_ref().map_or(1.0, |weights| weights[pixel])
+    }
+
+    /// Weights of the rays of these pixels, scaled to a mean of 1: losses of pictures with masks and without are then of one kind.
+    pub fn ray_weights(&self, pixels: impl Iterator<Item = usize>) -> Vec<f32> {
+        let weights: Vec<f32> = pixels.map(|pixel| self.weight(pixel)).collect();
+        let mean = weights.iter().sum::<f32>() / weights.len() as f32;
+        weights.into_iter().map(|weight| weight / mean).collect()
+    }
+
+    /// How many of the pixels that count the object covers.
+    pub fn area(&self) -> f64 {
+        self.coverage.iter().enumerate().map(|(pixel, cover)| f64::from(cover * self.weight(pixel))).sum()
     }
 }
 

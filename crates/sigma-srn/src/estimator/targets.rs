@@ -41,9 +41,9 @@ impl Targets {
             let query = &queries[hypothesis.query];
             slots.push(instances.binary_search(&query.instance).expect("collected above") as u32);
             rays.push(&DMat4::IDENTITY, &query.intrinsics, query.rays(phase.stride), &mut random);
-            let (colours, _) = query.seen(hypothesis.outline);
-            query.pixels(phase.stride).for_each(|pixel| rgb.extend_from_slice(&colours[3 * pixel..][..3]));
-            weights.extend(query.ray_weights(phase.stride));
+            let seen = query.seen(hypothesis.outline);
+            query.pixels(phase.stride).for_each(|pixel| rgb.extend_from_slice(&seen.rgb[3 * pixel..][..3]));
+            weights.extend(seen.ray_weights(query.pixels(phase.stride)));
         }
         if matches!(options.method, Method::Bfgs { .. }) {
             rays.z0.fill(MEAN_DEPTH);
@@ -55,7 +55,7 @@ impl Targets {
             height: across(queries[0].height),
             instances: instances.len() as u32,
         };
-        let weights = queries.iter().any(|query| query.weights.is_some()).then_some(weights);
+        let weights = weights.iter().any(|weight| *weight != 1.0).then_some(weights);
         Targets { shape, instances, slots, rays, rgb, weights }
     }
 
@@ -69,10 +69,11 @@ impl Targets {
         let values = 3 * self.rays_per_image();
         for ((hypothesis, render), rgb) in zip(running, renders.chunks(values)).zip(self.rgb.chunks_mut(values)) {
             let query = &queries[hypothesis.query];
-            let (_, coverage) = query.seen(hypothesis.outline);
             if query.coverage.is_some() {
-                let coverage: Vec<f32> = query.pixels(stride).map(|pixel| coverage[pixel]).collect();
-                let between = || Light::between(rgb, render, &coverage, &query.ray_weights(stride), query.has_outline());
+                let seen = query.seen(hypothesis.outline);
+                let coverage: Vec<f32> = query.pixels(stride).map(|pixel| seen.coverage[pixel]).collect();
+                let weights = || seen.ray_weights(query.pixels(stride));
+                let between = || Light::between(rgb, render, &coverage, &weights(), query.has_outline());
                 lights[hypothesis.query].get_or_insert_with(between).undo(rgb, &coverage);
             }
         }
