@@ -101,6 +101,13 @@ fn forms_are_tried_that_the_trial_would_not_choose() {
 }
 
 #[test]
+fn a_form_that_does_not_compile_keeps_no_other_from_being_used() {
+    let engine = Engine::gpu(faulty(|label| label == "linear/forward_workgroup", |_| "not WGSL".into()));
+    found(&engine).unwrap();
+    assert!(matches!(engine.as_gpu().unwrap().choice(), Choice::Measured { .. }));
+}
+
+#[test]
 fn threads_that_wait_for_the_cpu_do_not_wait_for_each_other() {
     let engine = Engine::gpu(gpu().with_choice(Choice::Measured { cache: None }));
     // Each trial runs on the threads that the searches are on.

@@ -83,7 +83,11 @@ impl Engine {
                 let mut fast = off(&gpu.without_cooperative())?;
                 if !gpu.adapter().is_software || width <= SOFTWARE_WIDTH {
                     for form in gpu.forms() {
-                        fast = fast.max(off(&named(form))?);
+                        // What does not run is never chosen.
+                        match off(&named(form)) {
+                            Ok(difference) => fast = fast.max(difference),
+                            Err(error) => tracing::debug!(%error, form, "no such form of kernels"),
+                        }
                     }
                 }
                 tracing::debug!(work, "the GPU's results differ from the CPU executor's by {fast:.1e} of the largest");
