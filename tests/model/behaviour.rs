@@ -363,6 +363,49 @@ fn shadows_are_cut_away() {
     assert_eq!(found(0, &[steps, outlines]).outline.unwrap().cut, DVec2::ZERO);
 }
 
+/// Where a mask lacks the lower part of the object, nothing below it counts; the pose is that of the whole.
+#[test]
+fn a_missing_part_is_not_taken_for_background() {
+    const SIDE: u32 = 28;
+    const MISSING: usize = 3;
+    let (ref model, instance, intrinsics) = shipped_forklift();
+    let engine = Engine::cpu();
+    let truth = camera::fixed24(1.3)[2];
+    let shown = Renderer::new(&engine, model, 1, SIDE, SIDE).unwrap().render(&[instance], &[(truth, intrinsics)], 0).unwrap();
+    let side = SIDE as usize;
+    let is_object = |pixel: usize| shown.rgb[3 * pixel..][..3].iter().any(|colour| *colour < 0.9);
+    let last = (0..side * side).filter(|&pixel| is_object(pixel)).max().unwrap() / side;
+    let found = |missing: usize, phases: &[(u32, bool)]| {
+        let is_in_mask = |pixel: usize| is_object(pixel) && pixel / side + missing <= last;
+        let coverage = (0..side * side).map(|pixel| f32::from(u8::from(is_in_mask(pixel)))).collect();
+        let colour = |value: usize| if is_in_mask(value / 3) { shown.rgb[value].clamp(-1.0, 1.0) } else { 1.0 };
+        let rgb = (0..3 * side * side).map(colour).collect();
+        let starts = vec![DMat4::from_rotation_z(0.05) * truth];
+        let (width, height, outline) = (SIDE, SIDE, Outline::AS_GIVEN);
+        let query = Query { instance, rgb, weights: None, coverage: Some(coverage), outline, width, height, intrinsics, starts };
+        let phase = |&(steps, outlines)| Phase { steps, stride: 1, keep: 1, light: false, outlines };
+        let phases = phases.iter().map(phase).collect();
+        let options = Options { phases, min_starts: 0, align: false, anew: 0, ..Options::default() };
+        let estimate = estimate(&engine, model, &[query], &options, |_| Ok(())).unwrap().remove(0);
+        let (degrees, off) = camera::pose_error(&estimate.pose.to_matrix(), &truth);
+        (estimate, degrees, off)
+    };
+    let (steps, outlines) = ((10, false), (5, true));
+    let [(without, ..), (with, degrees, off)] =
+        [[steps, steps].as_slice(), &[steps, outlines, steps]].map(|phases| found(MISSING, phases));
+    println!("{:.4} {:.4} {:?}, {degrees}° {off}", without.loss, with.loss, with.outline);
+    assert_eq!(with.outline.unwrap().missing, DVec2::new(0.0, 6.0));
+    assert!(with.loss < 0.2 * without.loss && degrees < 1.0 && off < 0.02, "{} {}: {degrees}° {off}", without.loss, with.loss);
+    // All that is in the mask counts. What is missing does not, but for what nothing of the mask is above.
+    let weights = with.weights.unwrap();
+    let (left, missing): (Vec<_>, Vec<_>) =
+        (0..side * side).filter(|&pixel| is_object(pixel)).partition(|pixel| pixel / side + MISSING <= last);
+    let counting = missing.iter().filter(|&&pixel| weights[pixel] > 0.0).count();
+    assert!(left.iter().all(|&pixel| weights[pixel] == 1.0) && 5 * counting < missing.len(), "{counting} of {}", missing.len());
+    assert!(without.weights.is_none());
+    assert_eq!(found(0, &[steps, outlines]).0.outline.unwrap().missing, DVec2::ZERO);
+}
+
 /// Where the coverage is known, dilations of it are tried; another picture beside it, or hypotheses that wait, are none the worse for it.
 #[test]
 fn masks_are_tried_dilated() {
@@ -415,7 +458,7 @@ fn masks_are_tried_dilated() {
         let without = [(0, 1, 6), (0, 1, 6), (1, 1, 6)];
         // Nearly a shadow: a closer look takes two steps more.
         let closer = [(2, 5, 6), (3, 5, 6), (4, 5, 6)];
-        let with = [[(0, 3, 6), (0, 3, 13), (1, 3, 13), (2, 3, 13)].as_slice(), &closer, &[(4, 5, 6), (5, 5, 6)]].concat();
+        let with = [[(0, 3, 6), (0, 3, 17), (1, 3, 17), (2, 3, 17)].as_slice(), &closer, &[(4, 5, 6), (5, 5, 6)]].concat();
         assert_eq!(steps, [&without[..], &with].concat());
 
         // What is known of the outline already, as from another frame, holds from the beginning; where dilations are tried, they are beside it.

@@ -1,15 +1,16 @@
 //! What the binaries share: choice of the executor, exit codes, data sets as the network takes them, progress.
 
 use std::error::Error;
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
-use clap::{Args, ValueEnum};
+use clap::{Arg, Args, Parser, ValueEnum};
 use glam::DMat4;
-use image::{Rgb, RgbImage};
-use indicatif::{ProgressBar, ProgressStyle};
-use sigma_srn::{Engine, Gpu, Intrinsics, Model};
+use image::{ImageFormat, Rgb, RgbImage};
+use indicatif::{HumanDuration, ProgressBar, ProgressState, ProgressStyle};
+use sigma_srn::{Engine, Gpu, Intrinsics, Model, write_atomically};
 use srn_data::camera::Axes;
 use srn_data::{Dataset, LoadedView, SrnSet, sheet};
 use tracing_subscriber::filter::{LevelFilter, Targets};
@@ -96,7 +97,7 @@ fn log(verbose: bool) {
     let level = if verbose { LevelFilter::DEBUG } else { LevelFilter::WARN };
     let ours = ["sigma", "srn"].map(|prefix| (prefix, level));
     let filter = Targets::new().with_default(LevelFilter::WARN).with_targets(ours);
-    let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal());
     // A second call in one process keeps the first one's setting.
     tracing_subscriber::registry().with(lines).with(filter).try_init().ok();
 }
@@ -129,6 +130,16 @@ pub(crate) fn axes(text: &str) -> std::result::Result<Axes, String> {
 pub(crate) fn named<T: Copy>(text: &str, all: &[T], name: fn(T) -> &'static str) -> std::result::Result<T, String> {
     let names = || all.iter().map(|&one| name(one)).collect::<Vec<_>>().join(", ");
     all.iter().copied().find(|&one| name(one) == text).ok_or_else(|| format!("expected one of {}", names()))
+}
+
+/// The flags of a program. A value that begins like a number below zero is a value, and what it is for says what is wrong with it.
+pub fn parse<T: Parser>() -> T {
+    let takes = |argument: Arg| {
+        let is_value = argument.get_action().takes_values() && !argument.is_positional();
+        argument.allow_negative_numbers(is_value)
+    };
+    let command = T::command().mut_subcommands(|command| command.mut_args(takes));
+    T::from_arg_matches(&command.get_matches()).unwrap_or_else(|error| error.exit())
 }
 
 /// The exit code of a binary: 0 done, 1 did not converge or was stopped, 2 an error, which is printed in one line.
@@ -191,6 +202,19 @@ pub fn print(text: &str) -> Result<()> {
     writeln!(std::io::stdout(), "{text}").map_err(|error| format!("stdout: {error}").into())
 }
 
+/// A path as text, also one that is no UTF-8.
+pub fn lossy<S: serde::Serializer>(path: &impl AsRef<Path>, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    serializer.collect_str(&path.as_ref().display())
+}
+
+/// Writes a picture in the format that its ending names, else as PNG; whole or not at all.
+pub fn write_picture(path: &Path, picture: &RgbImage) -> Result<()> {
+    let format = ImageFormat::from_path(path).unwrap_or(ImageFormat::Png);
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, format).map_err(|error| format!("{}: {error}", path.display()))?;
+    Ok(write_atomically(path, bytes.get_ref())?)
+}
+
 /// Reads a set of SRN instance folders as squares of `side` pixels.
 pub fn load_set(dir: &Path, side: u32) -> Result<Dataset> {
     Ok(SrnSet::open(dir)?.load(side as usize)?)
@@ -218,8 +242,13 @@ pub fn psnr(rendered: &[f32], target: &[f32]) -> f64 {
 
 /// A bar on stderr, with position, message and time left; nothing where stderr is not a terminal.
 pub fn progress(len: u64, what: &str) -> ProgressBar {
-    let template = format!("{what} {{bar:24}} {{pos}}/{{len}} {{msg}} {{eta}} left");
+    let template = format!("{what} {{bar:24}} {{pos}}/{{len}} {{msg}} {{left}}");
     let style = ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
+    // Before the first is done nothing is known of it.
+    let left = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+        let _ = if state.pos() > 0 { write!(out, "{} left", HumanDuration(state.eta())) } else { write!(out, "") };
+    };
+    let style = style.with_key("left", left);
     let bar = ProgressBar::new(len).with_style(style);
     bar.enable_steady_tick(Duration::from_millis(500));
     bar

@@ -14,7 +14,7 @@ use srn_data::inspect::{self, Origin};
 use srn_data::srn;
 use srn_data::target::MARGIN;
 
-use crate::common::{Result, axes, named, progress, refuse_existing, refuse_to_write};
+use crate::common::{Result, axes, named, print, progress, refuse_existing, refuse_to_write, write_picture};
 use crate::meshes;
 
 /// Flags that say what a source is, and how it differs from what its format promises.
@@ -90,6 +90,9 @@ impl Source {
             Some(format) => format,
             None => Format::detect(path)?,
         };
+        if self.object.is_some() && format != Format::Bop {
+            return Err(format!("--object is for BOP: {} is {}", path.display(), format.name()).into());
+        }
         let options = ReadOptions {
             axes: self.convention,
             inverted: self.inverted,
@@ -129,7 +132,7 @@ pub struct Import {
     #[arg(long, value_name = "LENGTH", value_parser = above_zero)]
     diagonal: Option<f64>,
     /// Without --diagonal, a box and silhouettes: the mean distance that the cameras get.
-    #[arg(long, value_name = "R", default_value_t = 1.3, value_parser = above_zero)]
+    #[arg(long, value_name = "R", default_value_t = 1.3, conflicts_with = "diagonal", value_parser = above_zero)]
     radius: f64,
     /// What is up in the source: x, -x, y, -y, z, -z, or `cameras`, what is up in the pictures. Default: z; COLMAP: cameras.
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true, value_parser = up)]
@@ -214,7 +217,7 @@ impl Import {
                 };
                 let written = formats::write(&part, Format::Srn, &self.out.join(folder), &options)?;
                 record.write(&written.dir)?;
-                bar.suspend(|| report(&part, &written, &format!("frame: {}", record.found_by)));
+                bar.suspend(|| report(&part, &written, &format!("frame: {}", record.found_by)))?;
                 if written.views == 0 {
                     return Err(format!("{}: no view could be written", written.dir.display()).into());
                 }
@@ -243,11 +246,11 @@ fn every(capture: &Capture, n: usize, these: bool) -> Capture {
 }
 
 /// One line on stdout about what was written; what was left out, on stderr.
-fn report(capture: &Capture, written: &Written, note: &str) {
+fn report(capture: &Capture, written: &Written, note: &str) -> Result<()> {
     let skipped: Vec<_> = capture.skipped.iter().chain(&written.skipped).collect();
     skipped.iter().for_each(|why| eprintln!("skipped: {why}"));
     written.warnings.iter().for_each(|what| eprintln!("warning: {what}"));
-    println!("{}: {} views written, {} skipped; {note}", written.dir.display(), written.views, skipped.len());
+    print(&format!("{}: {} views written, {} skipped; {note}", written.dir.display(), written.views, skipped.len()))
 }
 
 fn folder_name(name: &str) -> Result<String> {
@@ -327,6 +330,9 @@ impl Estimate {
 impl Export {
     /// Runs the command.
     pub fn run(&self) -> Result<bool> {
+        if self.scene.is_some() && self.format != Target::BopResults {
+            return Err("--scene is for --format bop-results".into());
+        }
         let format = Format::detect(&self.path)?;
         let mut captures = formats::read(&self.path, format, &ReadOptions::default())?;
         let estimates = self.poses.as_ref().map(|path| read_estimates(path)).transpose()?;
@@ -399,14 +405,14 @@ impl Export {
             }
             let results: Vec<_> = results.into_iter().map(|(_, result)| result).collect();
             bop::write_results(&self.out, &results, self.force)?;
-            println!("{}: {} estimates", self.out.display(), results.len());
+            print(&format!("{}: {} estimates", self.out.display(), results.len()))?;
             return Ok(true);
         };
         refuse_existing(captures.iter().map(|capture| formats::folder(capture, format, &self.out)), self.force)?;
         let options = WriteOptions { axes: self.convention, replace: self.force, ..WriteOptions::default() };
         for capture in &captures {
             let written = formats::write(capture, format, &self.out, &options)?;
-            report(capture, &written, &capture.name);
+            report(capture, &written, &capture.name)?;
         }
         Ok(true)
     }
@@ -438,10 +444,10 @@ pub struct Inspect {
     /// Print the findings as JSON.
     #[arg(long)]
     json: bool,
-    /// Write a contact sheet with the axes and a drawing of the cameras to this PNG file.
+    /// Write a contact sheet with the axes and a drawing of the cameras to this picture, a .png or .jpg.
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Overwrite the PNG file.
+    /// Overwrite the picture.
     #[arg(long)]
     force: bool,
 }
@@ -456,30 +462,34 @@ impl Inspect {
         if origin == Origin::Found {
             inspect::place_all(&mut captures, format.up())?;
         }
-        let report = inspect::inspect(&captures, self.source.convention.unwrap_or(format.axes()), origin);
+        let axes = self.source.convention.unwrap_or(format.axes());
+        let report = inspect::inspect(&captures, axes, self.source.inverted, origin);
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&report)?);
+            print(&serde_json::to_string_pretty(&report)?)?;
         } else {
             let head = ["instance", "views", "size", "focal px", "distance", "off axis", "facing"];
-            println!(
+            print(&format!(
                 "{:<24} {:>6} {:>12} {:>17} {:>15} {:>9} {:>6}",
                 head[0], head[1], head[2], head[3], head[4], head[5], head[6]
-            );
+            ))?;
             for i in &report.instances {
                 let sizes = i.sizes.keys().cloned().collect::<Vec<_>>().join(" ");
                 let range = |[low, high]: [f64; 2]| {
                     if high - low < 1e-6 * high { format!("{low:.3}") } else { format!("{low:.3} … {high:.3}") }
                 };
                 let (focal, radius, off) = (range(i.focal_px), range(i.radius), i.off_axis_deg);
-                println!("{:<24} {:>6} {sizes:>12} {focal:>17} {radius:>15} {off:>8.2}° {:>6}", i.name, i.views, i.facing);
+                print(&format!(
+                    "{:<24} {:>6} {sizes:>12} {focal:>17} {radius:>15} {off:>8.2}° {:>6}",
+                    i.name, i.views, i.facing
+                ))?;
             }
             let views: usize = report.instances.iter().map(|i| i.views).sum();
-            println!("{} instances, {views} views, {} problems", report.instances.len(), report.problems.len());
-            report.problems.iter().for_each(|problem| println!("problem: {problem}"));
-            report.notes.iter().for_each(|note| println!("note: {note}"));
+            print(&format!("{} instances, {views} views, {} problems", report.instances.len(), report.problems.len()))?;
+            report.problems.iter().try_for_each(|problem| print(&format!("problem: {problem}")))?;
+            report.notes.iter().try_for_each(|note| print(&format!("note: {note}")))?;
         }
         if let Some(out) = &self.out {
-            inspect::contact_sheet(&captures, 8, 16).save(out).map_err(|error| format!("{}: {error}", out.display()))?;
+            write_picture(out, &inspect::contact_sheet(&captures, 8, 16))?;
         }
         Ok(report.problems.is_empty())
     }

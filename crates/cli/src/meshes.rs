@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use srn_data::mesh::{self, Mesh};
 
-use crate::common::{Result, progress};
+use crate::common::{Result, print, progress};
 
 #[derive(Serialize)]
 struct Report {
@@ -51,7 +51,7 @@ pub fn inspect(paths: &[PathBuf], json: bool) -> Result<bool> {
     }
     let mut report = Report { files: vec![], formats: BTreeMap::new() };
     if !json {
-        println!("{:>9} {:>5} {:>8} {:>30} {:>8}  file", "triangles", "parts", "textures", "size", "warnings");
+        print(&format!("{:>9} {:>5} {:>8} {:>30} {:>8}  file", "triangles", "parts", "textures", "size", "warnings"))?;
     }
     let bar = progress(files.len() as u64, "meshes");
     for path in files {
@@ -64,20 +64,20 @@ pub fn inspect(paths: &[PathBuf], json: bool) -> Result<bool> {
         report.formats.entry(ending).or_default().add(&path, &found);
         let file = File { path, found };
         if !json {
-            bar.suspend(|| println!("{}", file.line()));
+            bar.suspend(|| print(&file.line()))?;
         }
         report.files.push(file);
         bar.inc(1);
     }
     bar.finish_and_clear();
     if json {
-        println!("{}", serde_json::to_string_pretty(&report)?);
+        print(&serde_json::to_string_pretty(&report)?)?;
     } else {
-        println!("\n{:<6} {:>6} {:>6} {:>13} {:>7}", "format", "files", "read", "with warnings", "refused");
+        print(&format!("\n{:<6} {:>6} {:>6} {:>13} {:>7}", "format", "files", "read", "with warnings", "refused"))?;
         for (ending, s) in &report.formats {
             let files = s.read + s.read_with_warnings + s.refused;
-            println!("{ending:<6} {files:>6} {:>6} {:>13} {:>7}", s.read, s.read_with_warnings, s.refused);
-            s.reasons.iter().for_each(|(reason, count)| println!("       refused {count}: {reason}"));
+            print(&format!("{ending:<6} {files:>6} {:>6} {:>13} {:>7}", s.read, s.read_with_warnings, s.refused))?;
+            s.reasons.iter().try_for_each(|(reason, count)| print(&format!("       refused {count}: {reason}")))?;
         }
     }
     Ok(report.formats.values().all(|summary| summary.refused == 0))

@@ -12,7 +12,7 @@ use srn_data::srn::{InstanceWriter, Intrinsics};
 use srn_data::{camera, ldraw, sheet};
 use srn_gpu::raster::{self, Rasterizer};
 
-use crate::common::{Result, progress, refuse_existing};
+use crate::common::{Result, print, progress, refuse_existing};
 use crate::sets::{Cache, Set};
 
 /// Flags of `sigma-data render`.
@@ -49,7 +49,7 @@ pub struct Render {
     /// Displaces each camera at random: its distance by up to this fraction, its aim by up to this fraction of the object's
     /// radius. Training views that are all at one distance, with one aim, make poses elsewhere less accurate. Of a set, only the
     /// training views are displaced.
-    #[arg(long, default_value_t = 0.0, value_parser = |x: &str| between(x, -f64::MIN_POSITIVE, 0.5))]
+    #[arg(long, default_value_t = 0.0, value_parser = jitter)]
     jitter: f64,
     /// Decides the random cameras, together with each instance's name.
     #[arg(long, default_value_t = 0)]
@@ -155,7 +155,12 @@ impl Render {
         }
         studio.bar.finish_and_clear();
         let focal = studio.intrinsics.focal[0];
-        println!("{} instances of {} views in {}, {focal:.3} px focal length", jobs.len(), self.views, self.out.display());
+        print(&format!(
+            "{} instances of {} views in {}, {focal:.3} px focal length",
+            jobs.len(),
+            self.views,
+            self.out.display()
+        ))?;
         Ok(())
     }
 
@@ -227,10 +232,10 @@ impl Render {
         saved.map_err(|error| format!("{}: {error}", sheet_file.display()))?;
         let [train, held_out] = counts;
         let (out, focal) = (self.out.display(), studio.intrinsics.focal[0]);
-        println!("{out}/train: {} instances of {views} views, {focal:.3} px focal length", train * self.variants);
-        println!("{out}/test: {train} instances of {test_views} views");
-        println!("{out}/heldout: {held_out} instances of {test_views} views");
-        println!("{}: a view of each object; {skipped} skipped", sheet_file.display());
+        print(&format!("{out}/train: {} instances of {views} views, {focal:.3} px focal length", train * self.variants))?;
+        print(&format!("{out}/test: {train} instances of {test_views} views"))?;
+        print(&format!("{out}/heldout: {held_out} instances of {test_views} views"))?;
+        print(&format!("{}: a view of each object; {skipped} skipped", sheet_file.display()))?;
         Ok(())
     }
 
@@ -291,6 +296,10 @@ fn between(text: &str, low: f64, high: f64) -> std::result::Result<f64, String> 
         _ if high == f64::MAX => Err(format!("expected a number above {low}")),
         _ => Err(format!("expected a number between {low} and {high}")),
     }
+}
+
+fn jitter(text: &str) -> std::result::Result<f64, String> {
+    text.parse().ok().filter(|x| (0.0..0.5).contains(x)).ok_or("expected a number from 0 to below 0.5".into())
 }
 
 fn subject(argument: &str) -> std::result::Result<Subject, String> {

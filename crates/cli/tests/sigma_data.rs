@@ -340,12 +340,22 @@ fn what_cannot_be_done_leaves_everything_as_it_was() {
 }
 
 #[test]
+#[cfg(target_os = "linux")]
+fn a_full_disk_is_an_error() {
+    let full = fs::File::options().write(true).open("/dev/full").unwrap();
+    let failed = Command::new(env!("CARGO_BIN_EXE_sigma-data")).args(["inspect", BOX]).stdout(full).output().unwrap();
+    assert!(failed.status.code() == Some(2) && stderr(&failed).contains("error: stdout: "), "{}", stderr(&failed));
+}
+
+#[test]
 fn the_doctor_says_what_to_try() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("set");
     let said = run(&["inspect", BOX, "--convention", "opencv"], 1);
     assert!(said.contains("4 of 4 cameras face away") && said.contains("try `--convention opengl`"), "{said}");
     assert!(run(&["inspect", BOX], 0).contains("0 problems"));
+    let said = run(&["inspect", BOX, "--inverted"], 1);
+    assert!(said.contains("try without `--inverted`"), "{said}");
     let report: serde_json::Value = serde_json::from_str(&run(&["inspect", BOX, "--json"], 0)).unwrap();
     assert_eq!((report["instances"][0]["facing"].as_u64(), report["problems"].as_array().unwrap().len()), (Some(4), 0));
     for (flags, word) in [

@@ -305,9 +305,12 @@ fn frames_come_on_stdin() {
         let answer: Value = serde_json::from_str(&poses.next().unwrap().unwrap()).unwrap();
         assert_eq!((answer["frame"].as_str(), &answer["searched"]), (Some(&path[..]), &Value::Bool(false)));
     }
-    writeln!(frames, "no-such.png").unwrap();
-    let answer: Value = serde_json::from_str(&poses.next().unwrap().unwrap()).unwrap();
-    assert!(answer["trusted"] == false && answer["failure"].as_str().unwrap().contains("no-such.png"), "{answer}");
+    // Whatever a path may be made of.
+    for (path, shown) in [(&b"no-such.png"[..], "no-such.png"), (b"\xff.png", "\u{fffd}.png")] {
+        frames.write_all(&[path, b"\n"].concat()).unwrap();
+        let answer: Value = serde_json::from_str(&poses.next().unwrap().unwrap()).unwrap();
+        assert!(answer["trusted"] == false && answer["failure"].as_str().unwrap().contains(shown), "{answer}");
+    }
     drop(frames);
     assert!(poses.next().is_none());
     assert_eq!(tracking.wait().unwrap().code(), Some(1));
@@ -468,6 +471,7 @@ fn bad_calls_end_with_2_and_one_line() {
     fs::write(dir.join("short.txt"), "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0").unwrap();
     fs::write(dir.join("text.safetensors"), "not a model").unwrap();
     fs::write(dir.join("text.png"), "not a picture").unwrap();
+    image::RgbImage::from_pixel(20, 10, image::Rgb([255; 3])).save(dir.join("white.png")).unwrap();
     let whole = fs::read(dir.join("model.safetensors")).unwrap();
     fs::write(dir.join("cut.safetensors"), &whole[..whole.len() / 2]).unwrap();
     let model = "--model model.safetensors";
@@ -501,8 +505,12 @@ fn bad_calls_end_with_2_and_one_line() {
         (format!("{image} {model} --loss mse"), &["--loss", "--preset paper"]),
         (format!("{image} {model} --lr 0.1"), &["--lr", "--preset paper"]),
         (format!("{image} {model} --steps 0"), &["--steps"]),
-        (format!("{image} {model} --lr -1"), &["-1"]),
-        (format!("{image} {model} --stride 100 --executor cpu"), &["stride"]),
+        (format!("{image} {model} --lr -1"), &["-1", "above 0"]),
+        (format!("{image} {model} --unseen --steps 3"), &["--unseen", "--steps"]),
+        (format!("estimate white.png {model} --fov 40 --instance seat"), &["white.png", "nothing but white"]),
+        (format!("track DATA/chicken/rgb {model} --truth short.txt"), &["--truth", "one frame"]),
+        (format!("bake {model} --instance seat --out . --force"), &["something else than a file"]),
+        (format!("{image} {model} --stride 100 --executor cpu"), &["chicken-000003", "stride"]),
         (format!("{image} {model} --preset paper --loss gmsd --stride 2 --executor cpu"), &["stride 1"]),
         (format!("{image} {model} --memory 1 --executor cpu"), &["budget of 1 bytes"]),
         (format!("{image} {model} --adapter no-such-card"), &["no-such-card"]),
@@ -525,7 +533,8 @@ fn bad_calls_end_with_2_and_one_line() {
     ] {
         fail(dir, &args, words);
     }
-    assert_eq!(files(dir), ["cut.safetensors", "model.safetensors", "nan.txt", "short.txt", "text.png", "text.safetensors"]);
+    let left = ["cut.safetensors", "model.safetensors", "nan.txt", "short.txt", "text.png", "text.safetensors", "white.png"];
+    assert_eq!(files(dir), left);
 }
 
 #[test]
@@ -777,7 +786,7 @@ fn a_mask_need_not_be_exact() {
         is_inside && picture.get_pixel(x as u32, y as u32).0 != [255; 3]
     };
     let mut found = vec![];
-    for (name, rim) in [("exact", 0), ("large", 1), ("small", -1), ("shadow", 3)] {
+    for (name, rim) in [("exact", 0), ("large", 1), ("small", -1), ("shadow", 3), ("short", -5)] {
         let cut = image::RgbaImage::from_fn(64, 64, |x, y| {
             let [x, y] = [x, y].map(i64::from);
             let mut around = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)].into_iter().map(|(dx, dy)| is_object(x + dx, y + dy));
@@ -785,6 +794,8 @@ fn a_mask_need_not_be_exact() {
                 0 => is_object(x, y),
                 1 => around.any(|is| is),
                 3 => (0..4).any(|below| is_object(x, y - below)),
+                // What is below a row is missing.
+                -5 => is_object(x, y) && y < 44,
                 _ => around.all(|is| is),
             };
             let behind = if rim == 3 { [50, 40, 30] } else { [128, 100, 60] };
@@ -802,15 +813,17 @@ fn a_mask_need_not_be_exact() {
             of(&image["error"]["translation_percent"]),
             of(&image["mask_dilation_px"]),
             of(&image["mask_cut_px"][1]),
+            of(&image["mask_missing_px"][1]),
         ));
     }
     println!("{found:.2?}");
-    let [exact, large, small, shadow] = found[..] else { panic!("{found:?}") };
+    let [exact, large, small, shadow, short] = found[..] else { panic!("{found:?}") };
     assert!(exact.2.abs() < 0.4 && large.2 < -0.7 && small.2 > 0.3, "{found:?}");
     // Measured: 3.3 and 1.7 %, where it is 10.8 and 10.0 % without.
     assert!(large.1 < 6.0 && small.1 < 6.0, "{found:?}");
     // Without being cut away the shadow has the object seem larger and lower. Measured: 5.1 %, for it is cut 4.4 pixels wide.
     assert!([exact, large, small].iter().all(|found| found.3 == 0.0) && shadow.3 > 1.0 && shadow.1 < 6.0, "{found:?}");
+    assert!([exact, large, small, shadow].iter().all(|found| found.4 == 0.0) && short.4 > 3.0 && short.1 < 6.0, "{found:?}");
     // From frame to frame it is found out once.
     let args = format!("track large.png large.png --model {model} --instance valve --executor cpu --json --focal 74.4");
     let lines = run(dir, &format!("{args} --rough {TEST}/valve/pose/000005.txt"), 0);

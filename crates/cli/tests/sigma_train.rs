@@ -266,6 +266,18 @@ fn bad_calls_end_with_2_and_one_line() {
 }
 
 #[test]
+fn a_run_is_trained_by_one_process() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    succeed(&format!("fit --data {TRAIN} --out {} {TINY} --steps 8 --executor cpu", run.display()));
+    let lock = fs::File::open(run.join("lock")).unwrap();
+    lock.lock().unwrap();
+    fail(&format!("fit --resume {} --steps 9", run.display()), &["run", "another fit"]);
+    drop(lock);
+    succeed(&format!("fit --resume {} --steps 9", run.display()));
+}
+
+#[test]
 fn a_resumed_run_must_find_what_it_began_with() {
     let dir = tempfile::tempdir().unwrap();
     let run = dir.path().join("run").display().to_string();

@@ -85,9 +85,16 @@ const LONGEST_TEXT: u64 = 1 << 30;
 
 /// Reads a text file of bearable length.
 pub(crate) fn read_text(path: &Path) -> Result<String> {
-    String::from_utf8(read_bytes(path)?)
+    let mut bytes = read_bytes(path)?;
+    // Some editors begin a text with this mark.
+    if bytes.starts_with(BYTE_ORDER_MARK) {
+        bytes.drain(..BYTE_ORDER_MARK.len());
+    }
+    String::from_utf8(bytes)
         .map_err(|error| Error::field(path, format!("byte {}", error.utf8_error().valid_up_to()), "UTF-8 text", "other bytes"))
 }
+
+const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
 
 /// Reads a file of bearable length.
 pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {

@@ -72,8 +72,8 @@ pub enum Origin {
     Found,
 }
 
-/// Looks at every picture and camera of captures in our frame. `assumed` are the axes that their poses were read with.
-pub fn inspect(captures: &[Capture], assumed: Axes, origin: Origin) -> Report {
+/// Looks at every picture and camera of captures in our frame. `assumed` are the axes that their poses were read with, `is_inverted` whether as the inverse.
+pub fn inspect(captures: &[Capture], assumed: Axes, is_inverted: bool, origin: Origin) -> Report {
     let mut report = Report { instances: vec![], problems: vec![], notes: vec![] };
     let mut shared: Option<(&str, [f64; 4])> = None;
     for capture in captures {
@@ -95,7 +95,7 @@ pub fn inspect(captures: &[Capture], assumed: Axes, origin: Origin) -> Report {
         if intrinsics != expected && seen.iter().all(|view| view.frame.camera.intrinsics == intrinsics) {
             report.notes.push(format!("{}: intrinsics differ from those of {other}", capture.name));
         }
-        report.check(&capture.name, &seen, assumed, origin);
+        report.check(&capture.name, &seen, assumed, is_inverted, origin);
     }
     report
 }
@@ -122,7 +122,7 @@ impl Seen<'_> {
 }
 
 impl Report {
-    fn check(&mut self, name: &str, seen: &[Seen], assumed: Axes, origin: Origin) {
+    fn check(&mut self, name: &str, seen: &[Seen], assumed: Axes, is_inverted: bool, origin: Origin) {
         let sees_origin = |view: &Seen| sees(DVec3::ZERO, view.frame, &view.frame.camera.world_from_camera);
         let n = seen.len();
         let pose = |view: &Seen| view.frame.camera.world_from_camera;
@@ -171,7 +171,7 @@ impl Report {
             self.problems.push(format!("{name}: {} of {n} cameras stand where the one before stands", same));
         }
         if facing * 10 < n * 8 {
-            self.problems.push(diagnosis(name, seen, assumed, origin, facing));
+            self.problems.push(diagnosis(name, seen, assumed, is_inverted, origin, facing));
         } else {
             for view in seen.iter().filter(|view| !sees_origin(view)) {
                 let angle = crate::camera::off_axis_deg(&pose(view));
@@ -232,7 +232,7 @@ impl Report {
 }
 
 /// What is probably wrong where cameras do not see the object: the reading of the poses under which they would.
-fn diagnosis(name: &str, seen: &[Seen], assumed: Axes, origin: Origin, facing: usize) -> String {
+fn diagnosis(name: &str, seen: &[Seen], assumed: Axes, is_inverted: bool, origin: Origin, facing: usize) -> String {
     let n = seen.len();
     let depth = |view: &&Seen| view.frame.camera.world_from_camera.inverse().w_axis.z;
     let away = seen.iter().filter(|view| depth(view) <= 0.0).count();
@@ -265,17 +265,16 @@ fn diagnosis(name: &str, seen: &[Seen], assumed: Axes, origin: Origin, facing: u
     let best = found.reduce(|best, next| if (next.0, next.1) > (best.0, best.1) { next } else { best });
     match best.filter(|(facing, ..)| facing * 10 >= n * 9) {
         Some((_, _, axes, inverted)) => {
-            let mut flags = String::new();
-            let mut looks = vec![];
+            let (mut looks, mut tries) = (vec![], vec![]);
             if inverted {
                 looks.push("inverted (world to camera)".to_owned());
-                flags += " --inverted";
+                tries.push(if is_inverted { "without `--inverted`".to_owned() } else { "`--inverted`".into() });
             }
             if axes != assumed {
                 looks.push(format!("in {} axes", axes.title()));
-                flags += &format!(" --convention {}", axes.name());
+                tries.push(format!("`--convention {}`", axes.name()));
             }
-            format!("{name}: the poses look {}: {what}; try `{}`", looks.join(", "), flags.trim())
+            format!("{name}: the poses look {}: {what}; try {}", looks.join(", "), tries.join(" "))
         }
         None => format!("{name}: {what}; is the object at the origin? `sigma-data import` moves it there"),
     }
@@ -385,7 +384,7 @@ mod tests {
 
     fn inspected(dir: &Path) -> (Vec<Capture>, Report) {
         let captures = read(dir, Format::Srn, &ReadOptions::default()).unwrap();
-        let report = inspect(&captures, Axes::OpenCv, Origin::Given);
+        let report = inspect(&captures, Axes::OpenCv, false, Origin::Given);
         (captures, report)
     }
 
@@ -442,7 +441,7 @@ mod tests {
             spoil(&dir.path().join("b").join(file));
             match read(dir.path(), Format::Srn, &ReadOptions::default()) {
                 Ok(captures) => {
-                    let report = inspect(&captures, Axes::OpenCv, Origin::Given);
+                    let report = inspect(&captures, Axes::OpenCv, false, Origin::Given);
                     let found = report.problems.iter().find(|problem| problem.contains(expected));
                     let named = found.is_some_and(|problem| problem.contains(&in_folder) || problem.starts_with("b:"));
                     assert!(named, "{expected}: {:?}", report.problems);
@@ -471,7 +470,7 @@ mod tests {
             assert!(report.problems.iter().any(|p| p.contains(expected)), "{expected}: {:?}", report.problems);
             // What the doctor says helps.
             let options = ReadOptions { axes: Some(axes), inverted, ..ReadOptions::default() };
-            let report = inspect(&read(dir.path(), Format::Srn, &options).unwrap(), axes, Origin::Given);
+            let report = inspect(&read(dir.path(), Format::Srn, &options).unwrap(), axes, false, Origin::Given);
             assert!(report.problems.is_empty(), "{:?}", report.problems);
         }
     }

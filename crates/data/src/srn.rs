@@ -7,6 +7,7 @@
 //! views differ, `intrinsics/NAME.txt` holds those of one view.
 
 use crate::camera::rigid_error;
+use crate::capture::FrameRecord;
 use crate::error::{At, Error, Result, read_text};
 use crate::pixels::{ENDINGS, Pixels, ends_like};
 use glam::DMat4;
@@ -365,8 +366,8 @@ pub struct InstanceWriter {
 }
 
 impl InstanceWriter {
-    /// Makes `dir` with its `intrinsics.txt`. If `dir` exists it is refused, or, with `replace`, its pictures, poses and
-    /// intrinsics are removed; files of other kinds stay.
+    /// Makes `dir` with its `intrinsics.txt`. If `dir` exists it is refused, or, with `replace`, its pictures, poses,
+    /// intrinsics and `frame.json` are removed; files of other kinds stay.
     pub fn create(dir: impl Into<PathBuf>, intrinsics: &Intrinsics, replace: bool) -> Result<Self> {
         let writer = Self::bare(dir, replace)?;
         writer.intrinsics(intrinsics)?;
@@ -381,9 +382,12 @@ impl InstanceWriter {
                 return Err(Error::Exists { path: dir });
             }
             let views = InstanceFiles::open(dir.clone()).map(|files| files.views).unwrap_or_default();
-            let own = |view: &ViewFiles| dir.join("intrinsics").join(format!("{}.txt", view.name));
-            let intrinsics: Vec<_> = views.iter().map(own).chain([dir.join("intrinsics.txt")]).filter(|p| p.exists()).collect();
-            for path in views.into_iter().flat_map(|view| [view.rgb, view.pose]).flatten().chain(intrinsics) {
+            let of_views = std::fs::read_dir(dir.join("intrinsics")).into_iter().flatten().flatten().map(|entry| entry.path());
+            let is_own = |path: &PathBuf| path.extension().is_some_and(|ending| ending == "txt");
+            // The frame that the views before were in, too.
+            let whole = [dir.join("intrinsics.txt"), dir.join(FrameRecord::FILE)].into_iter().filter(|path| path.exists());
+            let others: Vec<_> = of_views.filter(is_own).chain(whole).collect();
+            for path in views.into_iter().flat_map(|view| [view.rgb, view.pose]).flatten().chain(others) {
                 std::fs::remove_file(&path).at(&path)?;
             }
         }
@@ -609,11 +613,15 @@ mod tests {
         let thing = dir.path().join("thing");
         let notes = thing.join("notes.txt");
         write(&notes, "mine").unwrap();
+        std::fs::create_dir(thing.join("intrinsics")).unwrap();
+        let old = ["frame.json", "intrinsics/another.txt"].map(|name| thing.join(name));
+        old.iter().for_each(|path| write(path, "of the old views").unwrap());
         assert!(matches!(InstanceWriter::create(&thing, &INTRINSICS, false), Err(Error::Exists { .. })));
         assert_eq!(SrnSet::open(&thing).unwrap().instances[0].views.len(), 3);
         let writer = InstanceWriter::create(&thing, &INTRINSICS, true).unwrap();
         writer.add("new", &pictures[0], &uniform_sphere(1, 1.0, 0)[0]).unwrap();
         assert_eq!(SrnSet::open(&thing).unwrap().instances[0].views.len(), 1, "old views stayed");
+        assert!(old.iter().all(|path| !path.exists()));
         assert_eq!(std::fs::read_to_string(notes).unwrap(), "mine");
     }
 }

@@ -568,7 +568,7 @@ fn photographs_become_squares_around_the_object() {
         let (origin, depth) = frame.camera.project(DVec3::ZERO);
         assert!((origin - 23.5).length() < 6.0 && depth > 1.0, "{}: {origin}", frame.name);
     }
-    let report = inspect::inspect(&[squares.clone()], Axes::OpenCv, Origin::Given);
+    let report = inspect::inspect(&[squares.clone()], Axes::OpenCv, false, Origin::Given);
     assert!(report.problems.is_empty(), "{:?}", report.problems);
     assert!(report.instances[0].filled.is_some_and(|f| (0.75..1.1).contains(&f)), "{:?}", report.instances[0].filled);
 
@@ -595,7 +595,7 @@ fn photographs_become_squares_around_the_object() {
         formats::read(Path::new(BOX), Format::Transforms, &ReadOptions { axes: Some(Axes::OpenCv), ..Default::default() })
             .unwrap();
     inspect::place_all(&mut wrong, UpAxis::Cameras).unwrap();
-    let report = inspect::inspect(&wrong, Axes::OpenCv, Origin::Found);
+    let report = inspect::inspect(&wrong, Axes::OpenCv, false, Origin::Found);
     assert!(report.problems.iter().any(|p| p.contains("--convention opengl")), "{:?}", report.problems);
 }
 
@@ -661,7 +661,7 @@ fn survive(format: Format, path: &Path) -> Result<(), TestCaseError> {
         prop_assert!(rigid_error(&camera.world_from_camera) <= 2e-3, "{}", camera.world_from_camera);
         prop_assert!(camera.intrinsics.iter().chain(&camera.distortion).all(|x| x.is_finite()), "{:?}", camera);
     }
-    let report = inspect::inspect(&captures, format.axes(), Origin::Given);
+    let report = inspect::inspect(&captures, format.axes(), false, Origin::Given);
     prop_assert!(report.problems.iter().all(|line| !line.contains('\n')));
     inspect::contact_sheet(&captures, 2, 1);
     inspect::place_all(&mut captures, format.up()).ok();

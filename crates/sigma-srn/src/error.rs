@@ -53,8 +53,8 @@ pub enum Error {
         /// What is wrong, with both numbers.
         what: String,
     },
-    /// The memory budget is too small for even one ray.
-    #[error("the memory budget of {budget} bytes is too small: parameters and one row need {needed}")]
+    /// The memory budget is too small for even the smallest portions of the work.
+    #[error("the memory budget of {budget} bytes is too small: this work needs {needed}")]
     Budget {
         /// The budget.
         budget: u64,

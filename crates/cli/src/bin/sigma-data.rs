@@ -2,7 +2,7 @@
 //! into them.
 
 use clap::{Parser, Subcommand};
-use sigma_cli::common::finish;
+use sigma_cli::common::{finish, parse};
 use sigma_cli::data::{Export, Import, Inspect};
 use sigma_cli::render::Render;
 use sigma_cli::sets::Fetch;
@@ -12,7 +12,7 @@ use std::process::ExitCode;
 ///
 /// Exit status: 0 done, 1 `inspect` found problems, 2 an error.
 #[derive(Parser)]
-#[command(version, about)]
+#[command(name = "sigma-data", version, about)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -33,7 +33,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    finish(match Cli::parse().command {
+    finish(match parse::<Cli>().command {
         Command::Fetch(args) => args.run(),
         Command::Render(args) => args.run(),
         Command::Import(args) => args.run(),

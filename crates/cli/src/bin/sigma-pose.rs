@@ -3,14 +3,14 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use sigma_cli::common::finish;
+use sigma_cli::common::{finish, parse};
 use sigma_cli::pose::{bake, calibrate, estimate, evaluate, render, track};
 
 /// Camera poses of pictures by gradient descent through a neural renderer.
 ///
 /// Exit status: 0 done, 1 `estimate` found a pose that is not to be trusted, 2 an error.
 #[derive(Parser)]
-#[command(version, about)]
+#[command(name = "sigma-pose", version, about)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -28,12 +28,12 @@ enum Command {
     Calibrate(calibrate::Calibrate),
     /// Render an object from any side.
     Render(render::Render),
-    /// Write a few objects' networks to a small file of their own, which goes wherever a model goes but into training.
+    /// Write a few objects' networks to a small file of their own, a model for `estimate`, `track`, `evaluate` and `render`.
     Bake(bake::Bake),
 }
 
 fn main() -> ExitCode {
-    finish(match Cli::parse().command {
+    finish(match parse::<Cli>().command {
         Command::Estimate(args) => estimate::run(&args),
         Command::Track(args) => track::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),

@@ -8,9 +8,9 @@ use sigma_cli::train::{adapt, fit, torch};
 
 /// Trains σSRN models on SRN data sets.
 ///
-/// Results go to stdout, progress to stderr. Exit status: 0 done, 1 stopped before the end, 2 error.
+/// Results go to stdout, progress to stderr. Exit status: 0 done, 1 `fit` was stopped before the end, 2 an error.
 #[derive(Parser)]
-#[command(version)]
+#[command(name = "sigma-train", version)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -29,7 +29,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    common::finish(match Cli::parse().command {
+    common::finish(match common::parse::<Cli>().command {
         Command::Fit(args) => fit::fit(&args),
         Command::Adapt(args) => adapt::adapt(&args),
         Command::Import(args) => torch::import(&args),

@@ -16,7 +16,7 @@ use super::notation::{Notation, NotationArgs, ObjectPose};
 use super::outline;
 use super::record::Log;
 use super::search::{On, PoseError, SearchArgs, Starts, deviation, run as search, within_95};
-use crate::common::{EngineArgs, Result, create_dir, load_model, print, progress, refuse_existing, refuse_to_write};
+use crate::common::{EngineArgs, Result, create_dir, load_model, lossy, print, progress, refuse_existing, refuse_to_write};
 
 /// Pictures that are searched for side by side, enough to fill a large GPU. What was found of them is printed before the next ones are looked at.
 const AT_ONCE: usize = 32;
@@ -32,7 +32,7 @@ pub struct Estimate {
     object: ObjectArgs,
     /// An experiment. The object is none of the model's, but of their kind: a latent code is fitted to each picture together with the pose, beginning with
     /// those of the objects that look most alike.
-    #[arg(long, conflicts_with_all = ["instance", "record"])]
+    #[arg(long, conflicts_with_all = ["instance", "record", "preset", "effort", "loss", "steps", "lr", "cull", "no_cull", "stride"])]
     unseen: bool,
     /// With --unseen and one picture: write the model with this object, for further pictures of it.
     #[arg(long, value_name = "FILE", requires = "unseen")]
@@ -46,7 +46,8 @@ pub struct Estimate {
     #[arg(long, value_name = "FILE|DIR")]
     mask: Vec<PathBuf>,
     /// Where to start: `around84`, all around; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file
-    /// with 16 numbers per line, or in four lines, a `world_from_camera` each. Default: `neighbor4` with --rough, else `around84`.
+    /// with 16 numbers per line, or in four lines, a `world_from_camera` each. Default: `neighbor4` with --rough, else `around84`. Where there are fewer than
+    /// 84, six more are tried around each, turned by 40° about the object; they have the numbers that follow, from 0 on.
     #[arg(long, value_name = "around84|fixed24|neighbor4|FILE")]
     starts: Option<Starts>,
     /// Roughly known pose: a pose file, or `auto`, the one in the picture's SRN folder. Once, or once per picture.
@@ -87,6 +88,7 @@ struct Report {
 
 #[derive(Serialize)]
 struct ImageReport {
+    #[serde(serialize_with = "lossy")]
     image: PathBuf,
     instance: String,
     /// Rows of the 4×4 matrix, in the data set's frame and object units.
@@ -202,7 +204,8 @@ fn searched(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
         (left, before) = (left - 1, bar.position());
         bar.set_message("");
         for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
-            output.add(on.model.instance_name(picture.instance), found, &bar)?;
+            let starts = found.estimate.ranking.len();
+            output.add(on.model.instance_name(picture.instance), found, starts, &bar)?;
             if let Some(dir) = &args.record {
                 log.write(dir, i, picture, found, on)?;
                 outline::write(dir, &args.images[first + i], picture, found, on)?;
@@ -233,7 +236,7 @@ fn unseen(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
         if let Some(path) = &args.save_model {
             fitted.save(path)?;
         }
-        output.add("unseen".into(), &found, &bar)?;
+        output.add("unseen".into(), &found, starts.len(), &bar)?;
     }
     bar.finish_and_clear();
     Ok(())
@@ -284,10 +287,10 @@ struct Output<'a> {
 
 impl Output<'_> {
     /// Takes what was found of the next picture, and prints it, unless all is to be one JSON document.
-    fn add(&mut self, instance: String, found: &Found, bar: &ProgressBar) -> Result<()> {
+    fn add(&mut self, instance: String, found: &Found, starts: usize, bar: &ProgressBar) -> Result<()> {
         let image = self.image(instance, found);
         if !self.args.json {
-            bar.suspend(|| print(&image.line(found, self.notation)))?;
+            bar.suspend(|| print(&image.line(found, starts, self.notation)))?;
         }
         self.images.push(image);
         Ok(())
@@ -356,7 +359,7 @@ impl Output<'_> {
 
 impl ImageReport {
     /// What is printed without `--json`, the pose as it was asked for.
-    fn line(&self, found: &Found, notation: &Notation) -> String {
+    fn line(&self, found: &Found, starts: usize, notation: &Notation) -> String {
         let [a, b, c, x, y, z] = Pose6::from_matrix(&notation.written(&found.world_from_camera)).0;
         let [a, b, c] = [a, b, c].map(f64::to_degrees);
         let verdict = self.doubt.map_or(String::new(), |doubt| format!("  DO NOT TRUST: {doubt}"));
@@ -364,13 +367,12 @@ impl ImageReport {
         let error = self.error.map_or(String::new(), |error| format!("  error {}", notation.error(error)));
         format!(
             "{}  {}  rotation {a:.2}° {b:.2}° {c:.2}°  centre {x:.4} {y:.4} {z:.4}{deviation}  loss {:.4}  unexplained {:.0} %  \
-             start {} of {}  {:.1} s{error}{verdict}",
+             start {} of {starts}  {:.1} s{error}{verdict}",
             self.image.display(),
             self.instance,
             self.loss,
             100.0 * self.unexplained,
             self.start,
-            self.ranking.len(),
             self.seconds,
         )
     }

@@ -10,14 +10,14 @@ use srn_data::camera::Axes;
 use srn_data::sheet;
 
 use super::draw;
-use super::files::{Picture, write_png};
+use super::files::Picture;
 use super::notation::{Notation, NotationArgs};
 use super::search::{On, PoseError, SearchArgs, Starts, within_95};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::tables;
 use super::views;
-use crate::common::{EngineArgs, Result, create_dir, load_model, print, refuse_existing};
+use crate::common::{EngineArgs, Result, create_dir, load_model, print, refuse_existing, write_picture};
 
 /// Side of a view on the sheet, pixels.
 const SHOWN: u32 = 128;
@@ -165,7 +165,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     print(&if args.json { json.clone() } else { report.table() })?;
     if let (Some(dir), Some(sheet)) = (&args.out, sheet) {
         sigma_srn::write_atomically(&dir.join(files[0]), json.as_bytes())?;
-        write_png(&dir.join(files[1]), &sheet)?;
+        write_picture(&dir.join(files[1]), &sheet)?;
         eprintln!("{} in {}", files.join(" and "), dir.display());
     }
     Ok(true)

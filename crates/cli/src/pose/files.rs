@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use glam::DMat4;
 use image::codecs::gif::{GifEncoder, Repeat};
-use image::{Delay, Frame, ImageFormat, RgbImage};
+use image::{Delay, Frame, RgbImage};
 use sigma_srn::{Intrinsics, Model, Outline, write_atomically};
 use srn_data::formats::mask_in;
 use srn_data::srn::{self, picture_size};
@@ -20,6 +20,9 @@ use crate::common::Result;
 /// How long objects are in a picture, as a share of their diagonal: about that of a cube, of a ball in its box, and seen along the
 /// longest side.
 const SPAN: f64 = 0.8;
+
+/// Where all channels are at least this (of [-1, 1]) a picture shows background.
+const WHITE: f32 = 0.98;
 
 /// Flags that say what is looked for in pictures.
 #[derive(Args, Debug)]
@@ -183,6 +186,9 @@ impl Picture {
             (Some(_), None) => Target::of_view(path, mask.as_deref(), &intrinsics, side as usize)?,
             _ => Target::of_photo(path, cutout.as_deref(), mask.as_deref(), &intrinsics, side as usize)?,
         };
+        if target.rgb.iter().all(|&colour| colour >= WHITE) {
+            return Err(about("nothing but white: no object is in it").into());
+        }
         let [fx, fy, cx, cy] = target.intrinsics.map(f64::from);
         Ok(Picture {
             name: format!("{}-{stem}", model.instance_name(instance)),
@@ -217,13 +223,6 @@ pub fn warn_of_turned(picture: &Path) {
     if srn::is_turned(picture) {
         eprintln!("warning: {}: by its EXIF it is to be turned; its pixels are taken as they are stored", picture.display());
     }
-}
-
-/// Writes a picture as PNG, whole or not at all.
-pub fn write_png(path: &Path, picture: &RgbImage) -> Result<()> {
-    let mut bytes = std::io::Cursor::new(Vec::new());
-    picture.write_to(&mut bytes, ImageFormat::Png)?;
-    Ok(write_atomically(path, bytes.get_ref())?)
 }
 
 /// Writes an endless animation, whole or not at all; each frame with the seconds that it stays.

@@ -7,9 +7,9 @@ use sigma_srn::{Found, Intrinsics};
 use srn_data::pixels::Pixels;
 use srn_data::sheet::{self, BLACK, Colour};
 
-use super::files::{Picture, write_png};
+use super::files::Picture;
 use super::search::{On, render};
-use crate::common::Result;
+use crate::common::{Result, write_picture};
 
 /// Colour of the line; its rim is black.
 const LINE: Colour = [60, 255, 90];
@@ -43,7 +43,7 @@ pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, on: On) 
         silhouette.covers(in_square.map(|x| (x - 0.5) / WIDER as f64 + 0.5))
     };
     draw(&mut page, inside);
-    write_png(&dir.join(format!("{}-outline.png", picture.name)), &page)
+    write_picture(&dir.join(format!("{}-outline.png", picture.name)), &page)
 }
 
 /// Where a view shows the object.

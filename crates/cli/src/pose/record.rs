@@ -8,10 +8,10 @@ use sigma_srn::{Error, Found, Pose6, Progress};
 use srn_data::sheet::{self, BLACK, CURVES, Colour, Curve};
 
 use super::draw;
-use super::files::{Picture, write_gif, write_png};
+use super::files::{Picture, write_gif};
 use super::mask::MadeRight;
 use super::search::{On, PoseError, render};
-use crate::common::Result;
+use crate::common::{Result, write_picture};
 
 /// Side of a view on the pages, pixels.
 const SHOWN: u32 = 192;
@@ -81,7 +81,7 @@ impl Log {
         let renders = render(on, &views)?;
         let page = Page { log: self, index, picture, found, side: on.side, path: &path, chosen: &chosen };
         let rgb: Vec<&[f32]> = renders.iter().map(|render| &render.rgb[..]).collect();
-        write_png(&dir.join(format!("{}.png", picture.name)), &page.sheet(&rgb))?;
+        write_picture(&dir.join(format!("{}.png", picture.name)), &page.sheet(&rgb))?;
         write_gif(&dir.join(format!("{}.gif", picture.name)), page.animation(&rgb))
     }
 }

@@ -11,16 +11,19 @@ use srn_data::pixels::rgb8;
 use srn_data::sheet::VIRIDIS;
 use srn_data::srn::{self, InstanceWriter, read_pose};
 
-use super::files::{CameraArgs, instance_of, write_gif, write_png};
+use super::files::{CameraArgs, instance_of, write_gif};
 use super::notation::NotationArgs;
 use super::search::{On, render};
 use super::{draw, positive};
-use crate::common::{EngineArgs, Result, load_model, print, refuse_existing, refuse_to_write};
+use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing, refuse_to_write, write_picture};
 
 /// Side of a view where neither the flags nor the model say it, pixels.
 const SIDE: u32 = 64;
 /// Distance of the camera where neither the flags nor the model say it.
 const RADIUS: f64 = 1.3;
+
+/// Views that are rendered before progress is shown.
+const AT_ONCE: usize = 32;
 
 /// Flags of `sigma-pose render`.
 #[derive(Args, Debug)]
@@ -111,10 +114,15 @@ pub fn run(args: &Render) -> Result<bool> {
             false => rgb8(&view.rgb, side as usize, side as usize),
         }
     };
-    let pictures: Vec<RgbImage> =
-        render(On { engine: &engine, model: &model, side }, &views)?.iter().zip(&poses).map(draw).collect();
+    let bar = progress(views.len() as u64, "views");
+    let mut pictures: Vec<RgbImage> = vec![];
+    for (views, poses) in views.chunks(AT_ONCE).zip(poses.chunks(AT_ONCE)) {
+        pictures.extend(render(On { engine: &engine, model: &model, side }, views)?.iter().zip(poses).map(draw));
+        bar.inc(views.len() as u64);
+    }
+    bar.finish_and_clear();
     match kind.as_str() {
-        "png" => write_png(&args.out, &pictures[0])?,
+        "png" => write_picture(&args.out, &pictures[0])?,
         "gif" => write_gif(&args.out, pictures.into_iter().map(|picture| (picture, 0.08)))?,
         _ => {
             let writer = InstanceWriter::create(&args.out, &files_intrinsics, args.force)?;

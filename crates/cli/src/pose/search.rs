@@ -258,7 +258,17 @@ pub fn run(
     observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
 ) -> Result<Vec<Found>> {
     let queries: Vec<_> = pictures.iter().zip(starts).map(|(picture, starts)| query(picture, side, starts)).collect();
-    with_cooperative_said(engine, || Ok(search.run(engine, model, &queries, observe)?))
+    with_cooperative_said(engine, || {
+        search.run(engine, model, &queries, observe).map_err(|error| match error {
+            // The library numbers what it is given.
+            Error::Input { input, what } => {
+                let number = input.strip_prefix("image ").and_then(|number| number.parse::<usize>().ok());
+                let name = number.and_then(|number| Some(pictures.get(number)?.name.clone()));
+                Error::Input { input: name.unwrap_or(input), what }.into()
+            }
+            error => error.into(),
+        })
+    })
 }
 
 /// What is done, and then on stderr what cooperative matrices were found to be worth, if that was now.

@@ -9,14 +9,14 @@ use srn_data::camera::Axes;
 use srn_data::sheet::{self, CURVES, Curve};
 
 use super::evaluate::{Evaluate, ViewReport, pictures_sheet, view_report};
-use super::files::{Picture, write_png};
+use super::files::Picture;
 use super::heldout::Heldout;
 use super::notation::Notation;
 use super::search::{LOSSES, On, PoseError, Preset, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::views::{self, Views};
-use crate::common::{Result, create_dir, load_model, progress, refuse_existing};
+use crate::common::{Result, create_dir, load_model, progress, refuse_existing, write_picture};
 use crate::train::adapt::Fit;
 
 /// Files that are written.
@@ -114,7 +114,7 @@ pub fn write(args: &Evaluate, dir: &Path) -> Result<bool> {
     worst.retain(|(report, ..)| shown.insert((report.instance.clone(), report.view.clone())));
     let pictures: Vec<(ViewReport, &Picture, Found)> =
         worst.iter().map(|(report, picture, found)| (report.clone(), picture, found.clone())).collect();
-    write_png(&paths[4], &pictures_sheet(&pictures, side, WORST))?;
+    write_picture(&paths[4], &pictures_sheet(&pictures, side, WORST))?;
     let adapted = |heldout: &Heldout| -> Result<_> {
         let by = |fit: Fit| heldout.adapt(&bench.engine, &model, &fit);
         // The paper fits codes alone.
@@ -329,7 +329,7 @@ impl Bench<'_> {
         }
         write(FILES[1], rows)?;
         write(FILES[2], curves)?;
-        write_png(&self.dir.join(FILES[3]), &self.convergence())
+        write_picture(&self.dir.join(FILES[3]), &self.convergence())
     }
 
     /// The tables in Markdown.

@@ -1,10 +1,13 @@
 //! `sigma-pose track`: an object's pose from frame to frame.
 
+use std::io::BufRead;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use clap::Args;
+use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::{Confidence, Doubt, Found, Pose6, Tracked, Tracker};
+use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Tracked, Tracker};
 use srn_data::pixels::{ENDINGS, is_picture};
 
 use super::draw;
@@ -12,12 +15,15 @@ use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side
 use super::mask::MadeRight;
 use super::notation::{NotationArgs, ObjectPose};
 use super::search::{PoseError, SearchArgs, Starts, deviation, query, with_cooperative_said};
-use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
+use crate::common::{EngineArgs, Result, load_model, lossy, print, progress, refuse_to_write};
 
 /// Side of a frame in the animation, pixels.
 const SHOWN: u32 = 192;
 /// Seconds that it stays.
 const STAY: f64 = 0.1;
+
+/// Time after which a frame's search is shown.
+const PATIENCE: Duration = Duration::from_secs(1);
 
 /// Flags of `sigma-pose track`.
 #[derive(Args, Debug)]
@@ -62,6 +68,7 @@ pub struct Track {
 /// A line of `--json`.
 #[derive(Serialize)]
 struct FrameReport<'a> {
+    #[serde(serialize_with = "lossy")]
     frame: &'a Path,
     /// Rows of the 4×4 matrix, as the flags for poses want it.
     world_from_camera: [[f64; 4]; 4],
@@ -85,6 +92,10 @@ struct FrameReport<'a> {
 /// Runs the command; false where the last pose is not to be trusted.
 pub fn run(args: &Track) -> Result<bool> {
     let model = load_model(&args.object.model)?;
+    let is_single = matches!(&args.frames[..], [only] if only.is_file());
+    if matches!(args.truth, Some(PoseSource::File(_))) && !is_single {
+        return Err("--truth: a file has the pose of one frame; `auto` takes that in each frame's SRN folder".into());
+    }
     let mut frames = frames(&args.frames)?;
     let notation = args.poses.open()?;
     if let Some(path) = &args.record {
@@ -111,11 +122,11 @@ pub fn run(args: &Track) -> Result<bool> {
             Err(failure) if tracker.is_some() => {
                 trusted = false;
                 count += 1;
-                let (frame, failure) = (&path, failure.to_string());
+                let (frame, failure) = (path.display().to_string(), failure.to_string());
                 print(&if args.json {
                     serde_json::json!({ "frame": frame, "trusted": trusted, "failure": failure }).to_string()
                 } else {
-                    format!("{}  DO NOT TRUST: {failure}", frame.display())
+                    format!("{frame}  DO NOT TRUST: {failure}")
                 })?;
                 continue;
             }
@@ -132,7 +143,19 @@ pub fn run(args: &Track) -> Result<bool> {
         };
         count += 1;
         let frame = query(&picture, side, &starts);
-        let Tracked { found, is_searched: searched } = with_cooperative_said(&engine, || Ok(tracker.next(frame, |_| Ok(()))?))?;
+        let (began, mut bar) = (Instant::now(), None::<ProgressBar>);
+        let observe = |seen: Progress| {
+            // Most frames are done before anyone wonders.
+            if began.elapsed() > PATIENCE {
+                let bar = bar.get_or_insert_with(|| progress(0, "steps"));
+                bar.set_length(seen.steps.into());
+                bar.set_position(seen.step.into());
+            }
+            Ok(())
+        };
+        let tracked = with_cooperative_said(&engine, || Ok(tracker.next(frame, observe)?));
+        bar.iter().for_each(ProgressBar::finish_and_clear);
+        let Tracked { found, is_searched: searched } = tracked?;
         trusted = found.is_trusted();
         let mask = MadeRight::of(&found.estimate, picture.pixels_on_disk(side));
         let truth = args.truth.as_ref().map(|truth| truth.read(&path, &notation)).transpose()?;
@@ -190,14 +213,25 @@ fn frames(given: &[PathBuf]) -> Result<Frames> {
     Ok(Box::new(paths.into_iter().map(Ok)))
 }
 
-/// Blank lines are none.
+/// Blank lines are none. Paths are what the system takes for one, UTF-8 or not.
 fn paths_on_stdin() -> impl Iterator<Item = Result<PathBuf>> {
-    let path = |line: std::io::Result<String>| match line {
-        Ok(line) if line.trim().is_empty() => None,
-        Ok(line) => Some(Ok(line.trim().into())),
+    let path = |line: std::io::Result<Vec<u8>>| match line {
+        Ok(line) if line.trim_ascii().is_empty() => None,
+        Ok(line) => Some(Ok(path_of(line.trim_ascii()))),
         Err(error) => Some(Err(format!("stdin: {error}").into())),
     };
-    std::io::stdin().lines().filter_map(path)
+    std::io::stdin().lock().split(b'\n').filter_map(path)
+}
+
+#[cfg(unix)]
+fn path_of(bytes: &[u8]) -> PathBuf {
+    use std::os::unix::ffi::OsStrExt;
+    std::ffi::OsStr::from_bytes(bytes).into()
+}
+
+#[cfg(not(unix))]
+fn path_of(bytes: &[u8]) -> PathBuf {
+    String::from_utf8_lossy(bytes).into_owned().into()
 }
 
 fn pictures_in(dir: &Path) -> Result<Vec<PathBuf>> {

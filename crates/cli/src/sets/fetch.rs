@@ -11,7 +11,7 @@ use indicatif::ProgressBar;
 use sha2::{Digest, Sha256};
 
 use super::{Client, Package, Set, archive};
-use crate::common::{Result, bytes_progress};
+use crate::common::{Result, bytes_progress, print};
 
 /// Flags of `sigma-data fetch`.
 #[derive(Args, Debug)]
@@ -39,7 +39,7 @@ impl Fetch {
                     (folder, format!("{files} files"))
                 }
             };
-            println!("{}: {how}", folder.display());
+            print(&format!("{}: {how}", folder.display()))?;
         }
         Ok(true)
     }

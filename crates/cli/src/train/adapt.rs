@@ -14,7 +14,7 @@ use srn_data::{Instance, LoadedView};
 use super::reflection::{self, Reflection};
 use super::settings::{positive, up_to};
 use super::{Shown, psnr_of_each, render, training_batch};
-use crate::common::{self, EngineArgs, Result};
+use crate::common::{self, EngineArgs, Result, print};
 
 /// Unseen views of an instance that are looked at in the end, at most.
 const UNSEEN: usize = 8;
@@ -218,13 +218,13 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
     }
     model.save(&args.out)?;
     if args.json {
-        println!("{:#}", serde_json::json!({ "model": args.out, "instances": results }));
+        print(&format!("{:#}", serde_json::json!({ "model": args.out, "instances": results })))?;
     } else {
-        println!("{:<24} {:>14} {:>14}  reflections", "instance", "fitted views", "unseen views");
+        print(&format!("{:<24} {:>14} {:>14}  reflections", "instance", "fitted views", "unseen views"))?;
         for Fitted { instance, fitted_psnr, unseen_psnr, reflections } in &results {
             let [fitted, unseen] = [fitted_psnr, unseen_psnr].map(|psnr| psnr.map_or("-".into(), |psnr| format!("{psnr:.2} dB")));
             let reflections = if reflections.is_empty() { "-".into() } else { reflections.join(" ") };
-            println!("{instance:<24} {fitted:>14} {unseen:>14}  {reflections}");
+            print(&format!("{instance:<24} {fitted:>14} {unseen:>14}  {reflections}"))?;
         }
         let deviations = match model.metadata.calibration {
             Some(_) => "stated, as learnt from other new objects",
@@ -232,8 +232,8 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
                 "none stated: how far off such objects are found, `sigma-pose calibrate --heldout` learns from others, fitted as these are by default"
             }
         };
-        println!("deviations of their poses: {deviations}");
-        println!("model: {out}");
+        print(&format!("deviations of their poses: {deviations}"))?;
+        print(&format!("model: {out}"))?;
     }
     Ok(true)
 }

@@ -2,10 +2,10 @@
 //!
 //! A run's folder: `config.json` (all settings), `metrics.jsonl`, `samples/step_NNNNNN.png` (target, rendering, depth),
 //! `checkpoint.safetensors` (model and moments), in the end `model.safetensors` and `curves.png`. Metrics are written before the
-//! checkpoint; on resuming, lines behind the checkpoint's step are dropped, and those steps are done again.
+//! checkpoint; on resuming, lines behind the checkpoint's step are dropped, and those steps are done again. `lock` is held by who trains.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use sigma_srn::{Engine, Losses, Metadata, Model, Random, Train, Trainer, stream,
 use srn_data::{Dataset, SrnSet, pixels, sheet};
 
 use super::{Changeable, ForGood, Preset, Settings, Shown, psnr_of_each, render, training_batch};
-use crate::common::{self, EngineArgs, Result, load_model};
+use crate::common::{self, EngineArgs, Result, load_model, print, write_picture};
 
 /// Time between checkpoints.
 const CHECKPOINT_INTERVAL: Duration = Duration::from_secs(60);
@@ -57,6 +57,12 @@ pub struct FitArgs {
 pub fn fit(args: &FitArgs) -> Result<bool> {
     let is_resumed = args.resume.is_some();
     let run = args.resume.as_ref().or(args.out.as_ref()).ok_or("--out or --resume is needed")?;
+    // Held to the end. What is no run gets no lock.
+    let mut held = None;
+    if is_resumed {
+        Settings::read(run)?;
+        held = Some(lock(run)?);
+    }
     let mut settings = if is_resumed {
         let mut settings = Settings::read(run)?;
         settings.change(&args.changeable);
@@ -111,7 +117,12 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     if trainer.steps() > settings.steps {
         return Err(format!("--steps {}: the run has done {} already", settings.steps, trainer.steps()).into());
     }
+    // Whether there is memory for that, too, is found out before anything is written.
+    look(&engine, trainer.model()?, &watched, settings.side, orbit_radius)?;
     fs::create_dir_all(run).map_err(|error| format!("{}: {error}", run.display()))?;
+    if !is_resumed {
+        held = Some(lock(run)?);
+    }
     // Now that it is known whether a GPU is believed.
     (settings.executor, settings.memory) = (engine.to_string(), engine.budget());
     settings.write(run)?;
@@ -151,7 +162,7 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
                 if is_due(settings.validate_every) {
                     let (psnr, picture) = look(&engine, trainer.model()?, &watched, settings.side, orbit_radius)?;
                     let path = samples.join(format!("step_{step:06}.png"));
-                    picture.save(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+                    write_picture(&path, &picture)?;
                     record.validation_psnr = Some(psnr);
                 }
                 metrics.push(record)?;
@@ -173,17 +184,29 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     let model = run.join("model.safetensors");
     trainer.model()?.save(&model)?;
     let curves = run.join("curves.png");
-    metrics.curves().save(&curves).map_err(|error| format!("{}: {error}", curves.display()))?;
+    write_picture(&curves, &metrics.curves())?;
     let (steps, psnr) = (trainer.steps(), metrics.validation_psnr());
     let which = if validation.is_some() { "unseen" } else { "training" };
+    drop(held);
     if args.json {
         let result = serde_json::json!({ "model": model, "steps": steps, "views": which, "validation_psnr": psnr });
-        println!("{result:#}");
+        print(&format!("{result:#}"))?;
     } else {
-        println!("PSNR {:.2} dB on {} {which} views after {steps} steps", psnr.unwrap_or(f64::NAN), watched.len());
-        println!("model: {}", model.display());
+        print(&format!("PSNR {:.2} dB on {} {which} views after {steps} steps", psnr.unwrap_or(f64::NAN), watched.len()))?;
+        print(&format!("model: {}", model.display()))?;
     }
     Ok(true)
+}
+
+/// Only one process trains a run. The file stays, and is empty.
+fn lock(run: &Path) -> Result<File> {
+    let path = run.join("lock");
+    let file = File::create(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => Err(format!("{}: another fit is training it", run.display()).into()),
+        // Not every file system has locks.
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
+    }
 }
 
 /// Reads a set, the first `views` of each instance.

@@ -114,6 +114,7 @@ pub fn read(path: &Path, format: Format, options: &ReadOptions) -> Result<Vec<Ca
             let expected = "at least one usable view";
             let found = match &capture.skipped[..] {
                 [] => "none".into(),
+                [only] => format!("none; {only}"),
                 [first, rest @ ..] => format!("none; {first} (and {} more)", rest.len()),
             };
             return Err(Error::field(path, capture.name.clone(), expected, found));

@@ -13,6 +13,12 @@ use crate::Error;
 /// Marching steps of a file, at most: what a renderer allocates grows with them.
 const MOST_STEPS: f64 = 1000.0;
 
+/// Side of the pictures that a model takes, at most.
+const MOST_SIDE: f64 = 4096.0;
+
+/// What files of models call themselves.
+const FORMAT: &str = "sigma-srn 1";
+
 /// Named tensors of a file, with shape and values; those of other types than `F32` are left out.
 pub(crate) type Tensors = HashMap<String, (Vec<usize>, Vec<f32>)>;
 
@@ -51,16 +57,29 @@ impl Model {
         let calibration = |key: &str| serde_json::from_str(json(key)).map_err(|error| wrong(key, error));
         let instance_names: Option<Vec<String>> =
             serde_json::from_str(json("instance_names")).map_err(|error| wrong("instance_names", error))?;
-        let ray_sphere = match number("ray_sphere") {
-            Some(Ok(radius)) if radius > 0.0 && radius.is_finite() => Some(radius),
-            None => None,
-            Some(_) => return Err(format("metadata `ray_sphere` must be a positive number".into())),
+        let length = |key: &str| match number(key) {
+            Some(Ok(length)) if length > 0.0 && length.is_finite() => Ok(Some(length)),
+            None => Ok(None),
+            Some(_) => Err(format(format!("metadata `{key}` must be a positive number"))),
         };
+        let side = match number("side") {
+            Some(Ok(side)) if (1.0..=MOST_SIDE).contains(&side) && side.fract() == 0.0 => Some(side as u32),
+            None => None,
+            Some(_) => return Err(format(format!("metadata `side` must be a whole number from 1 to {MOST_SIDE}"))),
+        };
+        if let Some(other) = text.get("format").filter(|name| name.starts_with("sigma-srn ") && *name != FORMAT) {
+            return Err(format(format!("metadata `format` is `{other}`, and this program reads `{FORMAT}`")));
+        }
+        let mut names: Vec<&String> = instance_names.iter().flatten().collect();
+        names.sort_unstable();
+        if let Some(twice) = names.windows(2).find(|pair| pair[0] == pair[1]) {
+            return Err(format(format!("metadata `instance_names`: two are called `{}`", twice[0])));
+        }
         let metadata = Metadata {
             instance_names: instance_names.unwrap_or_default(),
-            side: number("side").and_then(Result::ok).map(|side| side as u32),
-            orbit_radius: number("orbit_radius").and_then(Result::ok),
-            ray_sphere,
+            side,
+            orbit_radius: length("orbit_radius")?,
+            ray_sphere: length("ray_sphere")?,
             distances: serde_json::from_str(json("distances")).map_err(|error| wrong("distances", error))?,
             calibration: calibration("calibration")?,
             calibration_of_new: calibration("calibration_of_new")?,
@@ -75,7 +94,7 @@ impl Model {
 
     pub(crate) fn metadata_text(&self) -> HashMap<String, String> {
         let mut text = HashMap::from([
-            ("format".to_string(), "sigma-srn 1".to_string()),
+            ("format".to_string(), FORMAT.to_string()),
             ("tracing_steps".into(), self.layout.tracing_steps.to_string()),
             ("density".into(), self.layout.density.is_some().to_string()),
             ("hidden".into(), self.layout.features().to_string()),
@@ -137,13 +156,22 @@ pub(crate) fn write_tensors(
 /// Writes a file so that at any moment either the old or the new content is there.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     let io = |source| Error::Io { path: path.into(), source };
+    // A device or a pipe would be replaced, and a folder cannot be.
+    if std::fs::metadata(path).is_ok_and(|there| !there.is_file()) {
+        return Err(io(std::io::Error::other("there is something else than a file")));
+    }
     let mut name = path.file_name().unwrap_or_default().to_os_string();
     name.push(".partial");
     let temporary = path.with_file_name(name);
-    let mut file = std::fs::File::create(&temporary).map_err(io)?;
-    std::io::Write::write_all(&mut file, bytes).map_err(io)?;
-    file.sync_all().map_err(io)?;
-    std::fs::rename(&temporary, path).map_err(io)
+    let written = std::fs::File::create(&temporary).and_then(|mut file| {
+        std::io::Write::write_all(&mut file, bytes)?;
+        file.sync_all()?;
+        std::fs::rename(&temporary, path)
+    });
+    written.map_err(|source| {
+        let _ = std::fs::remove_file(&temporary);
+        io(source)
+    })
 }
 
 /// Tensors and metadata of a file.
