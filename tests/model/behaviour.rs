@@ -394,7 +394,7 @@ fn a_missing_part_is_not_taken_for_background() {
     let [(without, ..), (with, degrees, off)] =
         [[steps, steps].as_slice(), &[steps, outlines, steps]].map(|phases| found(MISSING, phases));
     println!("{:.4} {:.4} {:?}, {degrees}° {off}", without.loss, with.loss, with.outline);
-    assert_eq!(with.outline.unwrap().missing, DVec2::new(0.0, 6.0));
+    assert_eq!(with.outline.unwrap().missing, DVec2::new(0.0, 12.0));
     assert!(with.loss < 0.2 * without.loss && degrees < 1.0 && off < 0.02, "{} {}: {degrees}° {off}", without.loss, with.loss);
     // All that is in the mask counts. What is missing does not, but for what nothing of the mask is above.
     let weights = with.weights.unwrap();

@@ -76,8 +76,9 @@ const SIDES: [DVec2; 8] = [
     DVec2::new(FRAC_1_SQRT_2, -FRAC_1_SQRT_2),
 ];
 
-/// How far from a mask nothing may be known; above it, below it, or to one side, which is enough of what lies between them, too.
-pub(crate) const MISSING: f64 = 6.0;
+/// How far from a mask nothing may be known, a fourth of the object: no farther than that is never better (`docs/accuracy.md`). Above it, below it, or to one
+/// side, which is enough of what lies between them, too.
+pub(crate) const MISSING: f64 = 12.0;
 
 /// What is tried of a mask: the first is as given.
 pub(crate) fn outlines() -> impl Iterator<Item = Outline> {

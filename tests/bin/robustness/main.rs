@@ -117,6 +117,7 @@ const TABLES: [Table; 6] = [
             row("shadow of 16", Spoil::Shadow([0, 16])),
             row("shadow of 8, 8", Spoil::Shadow([8, 8])),
             row("a tenth missing", Spoil::Missing(0.1)),
+            row("a fifth missing, four sides", Spoil::Lacking(0.2)),
         ],
     },
     Table {

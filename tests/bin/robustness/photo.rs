@@ -31,6 +31,8 @@ pub enum Spoil {
     Shadow([i64; 2]),
     /// This part of its height missing in the mask, below.
     Missing(f64),
+    /// This part of it missing in the mask, on one of four sides.
+    Lacking(f64),
     /// The segmentation says what counts; around the object there is anything.
     Alone,
     /// A bar over this part of it, from one of four sides.
@@ -72,7 +74,7 @@ impl Photo {
         Photo { picture: RgbImage::from_fn(SIDE, SIDE, colour), object: GrayImage::from_fn(SIDE, SIDE, object) }
     }
 
-    /// With something wrong; bars and edges come from another side in each `view`.
+    /// With something wrong; bars, edges and what is lacking come from another side in each `view`.
     pub fn spoiled(&mut self, spoil: Spoil, view: usize, random: &mut Pcg64Mcg) -> Spoiled {
         let [[_, right], [top, bottom]] = self.extent();
         let (mut seen, mut mask, mut frame) = (self.object.clone(), None, [[0, SIDE]; 2]);
@@ -108,6 +110,10 @@ impl Photo {
             Spoil::Missing(part) => {
                 let first = bottom - (part * f64::from(bottom - top)) as u32;
                 fill(&mut seen, |_, y| y >= first, OUTSIDE);
+            }
+            Spoil::Lacking(part) => {
+                let side = self.side(part, view);
+                fill(&mut seen, |x, y| [x, y].iter().zip(side).all(|(at, [first, end])| (first..end).contains(at)), OUTSIDE);
             }
             Spoil::Alone => mask = Some(std::mem::replace(&mut seen, GrayImage::from_pixel(SIDE, SIDE, INSIDE))),
             Spoil::Bar(part) => {
