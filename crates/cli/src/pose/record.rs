@@ -147,14 +147,14 @@ impl Page<'_> {
     fn target(&self) -> Panel {
         let rgb = self.counted(&self.picture.rgb, [-0.2, -0.2, 0.2]);
         let mut captions = vec!["the picture given".into()];
-        captions.extend(self.picture.weights.as_ref().map(|_| "blue-grey: masked out".into()));
+        captions.extend(self.found.estimate.weights.as_ref().map(|_| "blue-grey: not counted".into()));
         captions.extend(MadeRight::of(&self.found.estimate, self.picture.pixels_on_disk(self.side)).captions());
         Panel { heading: "TARGET".into(), view: draw::view(&rgb, self.side, SHOWN), captions }
     }
 
     /// Colours, `instead` where pixels do not count.
     fn counted(&self, rgb: &[f32], instead: [f32; 3]) -> Vec<f32> {
-        let weight = |pixel: usize| self.picture.weights.as_ref().map_or(1.0, |weights| weights[pixel]);
+        let weight = |pixel: usize| self.found.estimate.weights.as_ref().map_or(1.0, |weights| weights[pixel]);
         let mix = |(value, &colour): (usize, &f32)| weight(value / 3) * colour + (1.0 - weight(value / 3)) * instead[value % 3];
         rgb.iter().enumerate().map(mix).collect()
     }

@@ -88,7 +88,7 @@ impl Engine {
         Engine { budget, ..self }
     }
 
-    /// The same with at most `rows` rays in flight.
+    /// The same with at most `rows` rays in flight, but for work that would take more than a thousand turns so.
     pub fn with_tile_rows(self, rows: u32) -> Self {
         Engine { tile_rows: Some(rows.max(1)), ..self }
     }
@@ -160,7 +160,7 @@ impl Engine {
             Kind::Cpu(_) => srn_cpu::rows_for_all_threads(features as usize) as u32,
         });
         let least = rows.div_ceil(MOST_TILES).max(1);
-        // A plan with tiles of so many rows, or what it needs where that is too much.
+        // A plan with tiles of so many rows, or what it needs where that is too much: anything where the device can bind no such buffer.
         let attempt = |tile_rows: u32| {
             let mut builder = self.builder();
             match build(&mut builder, tile_rows).and_then(|rest| Ok((builder.finish()?, rest))) {
@@ -170,10 +170,14 @@ impl Engine {
                 Err(error) => Err(Error::from(error)),
             }
         };
+        let smaller = |tile_rows: u32| (tile_rows * 3 / 4).max(least);
         let mut tile_rows = rows.min(preferred).max(least);
-        let needed = match attempt(tile_rows)? {
-            Ok(built) => return Ok(built),
-            Err(needed) => needed,
+        let needed = loop {
+            match attempt(tile_rows)? {
+                Ok(built) => return Ok(built),
+                Err(u64::MAX) => tile_rows = smaller(tile_rows),
+                Err(needed) => break needed,
+            }
         };
         // The smallest tiles say at once whether any fit, and how much a row takes.
         let smallest = match attempt(least)? {
@@ -186,7 +190,7 @@ impl Engine {
             if let Ok(built) = attempt(tile_rows)? {
                 return Ok(built);
             }
-            tile_rows = (tile_rows * 3 / 4).max(least);
+            tile_rows = smaller(tile_rows);
         }
         Ok(smallest)
     }
@@ -266,5 +270,41 @@ impl std::ops::DerefMut for Runner {
             Runner::Cpu(executor) => executor.as_mut(),
             Runner::Gpu(executor) => executor,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use srn_plan::ops::latent_loss;
+
+    use super::*;
+
+    /// A plan of so many bytes a row, for a device that binds no more than `most` rows.
+    fn built(engine: &Engine, rows: u32, most: u32) -> Result<u32, Error> {
+        let build = |b: &mut Builder, tile_rows: u32| {
+            if tile_rows > most {
+                return Err(PlanError::TooLarge { buffer: "rows".into(), bytes: tile_rows.into(), limit: most.into() });
+            }
+            let [z, d_z] = [b.input("z", tile_rows as usize)?, b.input("d z", tile_rows as usize)?];
+            b.stage("all");
+            latent_loss::backward(b, tile_rows, 1.0, z, d_z)?;
+            Ok(tile_rows)
+        };
+        engine.fit(rows, 64, build).map(|(_, tile_rows)| tile_rows)
+    }
+
+    #[test]
+    fn tiles_are_as_large_as_the_budget_and_the_device_allow() {
+        let rows = 1 << 20;
+        let engine = Engine::cpu().with_tile_rows(100_000);
+        assert_eq!(built(&engine, rows, u32::MAX).unwrap(), 100_000);
+        assert_eq!(built(&engine, 70, u32::MAX).unwrap(), 70);
+        assert_eq!(built(&engine, rows, 75_000).unwrap(), 75_000);
+        // Eight bytes a row.
+        let budget = |bytes: u64| built(&engine.clone().with_budget(bytes), rows, 80_000);
+        assert_eq!([budget(600_000).unwrap(), budget(400_000).unwrap(), budget(8 * 1024).unwrap()], [75_000, 50_000, 1024]);
+        // More than a thousand tiles would fill the memory with steps.
+        assert!(matches!(budget(8 * 1024 - 1), Err(Error::Budget { needed: 8192, .. })));
+        assert_eq!(built(&engine.with_tile_rows(10), rows, u32::MAX).unwrap(), 1024);
     }
 }
