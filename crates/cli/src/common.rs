@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
+use clap::builder::NonEmptyStringValueParser;
 use clap::{Arg, Args, Parser, ValueEnum};
 use glam::DMat4;
 use image::{ImageFormat, Rgb, RgbImage};
@@ -26,7 +27,7 @@ pub struct EngineArgs {
     #[arg(long, value_enum, default_value_t = Executor::Auto)]
     executor: Executor,
     /// The graphics adapter, by words of its name or backend (`intel`, `geforce dx12`); implies `--executor gpu`.
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = NonEmptyStringValueParser::new())]
     adapter: Option<String>,
     /// Memory budget, as bytes or with a unit: 512MiB, 2GB. Default: from the adapter, 2 GiB on the CPU.
     #[arg(long, value_name = "SIZE", value_parser = memory)]

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, ValueEnum};
 use glam::{DMat4, DVec3};
 use image::RgbImage;
@@ -70,7 +71,7 @@ pub struct Render {
     #[arg(long)]
     force: bool,
     /// The graphics adapter, by words of its name or backend (`intel`, `geforce dx12`). Default: the fastest kind.
-    #[arg(long)]
+    #[arg(long, value_parser = NonEmptyStringValueParser::new())]
     adapter: Option<String>,
 }
 

@@ -252,6 +252,9 @@ struct Fitted {
 /// The views to fit to, and some of the others.
 fn split<'a>(args: &AdaptArgs, instance: &'a Instance) -> Result<(Vec<&'a LoadedView>, Vec<&'a LoadedView>)> {
     let (count, wanted) = (args.views as usize, &args.view);
+    if let Some((_, again)) = wanted.iter().enumerate().find(|(k, name)| wanted[..*k].contains(name)) {
+        return Err(format!("--view {again}: given twice").into());
+    }
     let unknown = wanted.iter().find(|name| instance.views.iter().all(|view| view.name != **name));
     if let Some(name) = unknown {
         return Err(format!("--view {name}: instance `{}` has no view of this name", instance.name).into());
