@@ -4,8 +4,8 @@ use std::iter::zip;
 
 use glam::{DMat4, DVec2, DVec3};
 use sigma_srn::{
-    Descent, Engine, Intrinsics, Loss, Method, Model, ModelConfig, Options, Outline, Phase, Pose6, Query, Rays, Renderer, Shape,
-    Train, Trainer, TrainingBatch,
+    Descent, Engine, Estimate, Intrinsics, Loss, Method, Model, ModelConfig, Options, Outline, Phase, Pose6, Query, Rays,
+    Renderer, Shape, Train, Trainer, TrainingBatch,
 };
 use sigma_srn::{camera, estimate, estimate_unseen, pixel_grid, stream};
 use srn_tests::{difference, gpu};
@@ -197,7 +197,7 @@ fn light_is_made_up_for() {
         let search = |queries: &[Query]| estimate(&engine, model, queries, &options, |_| Ok(())).unwrap();
         let [unknown, known] = [false, true].map(|is_known| search(&[0, 1, 2].map(|k| query(k, is_known))));
         let [off, errors] = [&unknown, &known].map(|found| {
-            let error = |(found, truth): (&sigma_srn::Estimate, _)| camera::pose_error(&found.pose.to_matrix(), truth).0;
+            let error = |(found, truth): (&Estimate, _)| camera::pose_error(&found.pose.to_matrix(), truth).0;
             zip(found, &truths).map(error).collect::<Vec<f64>>()
         });
         let contrasts: Vec<f32> = known.iter().map(|found| found.light.unwrap().contrast).collect();
@@ -294,7 +294,7 @@ fn what_has_not_arrived_goes_on() {
             (found, seen)
         };
         let [(short, _), (once, _), (long, seen)] = [0, 1, 9].map(|anew| search(&options(anew)));
-        let error = |found: &sigma_srn::Estimate| camera::pose_error(&found.pose.to_matrix(), &truth).0;
+        let error = |found: &Estimate| camera::pose_error(&found.pose.to_matrix(), &truth).0;
         let (last, errors) = (seen.last().unwrap(), [&short, &once, &long].map(|found| error(&found[1])));
         println!("{engine}: {errors:.2?}° after 4, 8 and {} steps", last.0);
         // Measured: 5.5°, 2.6°, and 0.04° after 16 steps.
@@ -325,74 +325,71 @@ pub fn with_rim(view: &[f32], side: usize) -> (Vec<f32>, Vec<f32>) {
     ((0..3 * side * side).map(colour).collect(), coverage)
 }
 
+/// A view of the forklift cut out exactly, with a start near its pose, and that pose.
+fn forklift_cut_out() -> (Model, Query, DMat4) {
+    const SIDE: u32 = 28;
+    let (model, instance, intrinsics) = shipped_forklift();
+    let truth = camera::fixed24(1.3)[2];
+    let mut renderer = Renderer::new(&Engine::cpu(), &model, 1, SIDE, SIDE).unwrap();
+    let rgb = renderer.render(&[instance], &[(truth, intrinsics)], 0).unwrap().rgb;
+    let is_object = |pixel: &[f32]| pixel.iter().any(|colour| *colour < 0.9);
+    let coverage = Some(rgb.chunks(3).map(|pixel| f32::from(u8::from(is_object(pixel)))).collect());
+    let rgb = rgb.chunks(3).flat_map(|pixel| if is_object(pixel) { pixel.to_vec() } else { vec![1.0; 3] });
+    let (rgb, starts) = (rgb.map(|colour| colour.clamp(-1.0, 1.0)).collect(), vec![DMat4::from_rotation_z(0.05) * truth]);
+    let (width, height, outline) = (SIDE, SIDE, Outline::AS_GIVEN);
+    (model, Query { instance, rgb, weights: None, coverage, outline, width, height, intrinsics, starts }, truth)
+}
+
+/// Where steps at all pixels lead; other outlines are tried in these phases or not.
+fn with_outlines(model: &Model, query: Query, phases: &[(u32, bool)]) -> Estimate {
+    let phase = |&(steps, outlines)| Phase { steps, stride: 1, keep: 1, light: false, outlines };
+    let phases = phases.iter().map(phase).collect();
+    let options = Options { phases, min_starts: 0, align: false, anew: 0, ..Options::default() };
+    estimate(&Engine::cpu(), model, &[query], &options, |_| Ok(())).unwrap().remove(0)
+}
+
+const STEPS: (u32, bool) = (10, false);
+const OUTLINES: (u32, bool) = (5, true);
+
 /// A shadow that was taken for the object is cut away, and nothing of a mask without one.
 #[test]
 fn shadows_are_cut_away() {
-    const SIDE: u32 = 28;
-    let (ref model, instance, intrinsics) = shipped_forklift();
-    let engine = Engine::cpu();
-    let truth = camera::fixed24(1.3)[2];
-    let shown = Renderer::new(&engine, model, 1, SIDE, SIDE).unwrap().render(&[instance], &[(truth, intrinsics)], 0).unwrap();
-    let side = SIDE as usize;
-    let is_object = |pixel: usize| shown.rgb[3 * pixel..][..3].iter().any(|colour| *colour < 0.9);
+    let (model, exact, _) = forklift_cut_out();
+    let side = exact.width as usize;
     // `wide` pixels below what is the object.
-    let masked = |wide: usize| {
-        let is_in_mask = |pixel: usize| (0..=wide).any(|k| pixel >= k * side && is_object(pixel - k * side));
-        let coverage = (0..side * side).map(|pixel| f32::from(u8::from(is_in_mask(pixel)))).collect();
-        let colour = |value: usize| match (is_object(value / 3), is_in_mask(value / 3)) {
-            (true, _) => shown.rgb[value].clamp(-1.0, 1.0),
-            (_, true) => [-0.5, -0.6, -0.7][value % 3],
-            _ => 1.0,
-        };
-        let rgb = (0..3 * side * side).map(colour).collect();
-        let starts = vec![DMat4::from_rotation_z(0.05) * truth];
-        let (width, height, outline) = (SIDE, SIDE, Outline::AS_GIVEN);
-        Query { instance, rgb, weights: None, coverage: Some(coverage), outline, width, height, intrinsics, starts }
-    };
     let found = |wide: usize, phases: &[(u32, bool)]| {
-        let phase = |&(steps, outlines)| Phase { steps, stride: 1, keep: 1, light: false, outlines };
-        let phases = phases.iter().map(phase).collect();
-        let options = Options { phases, min_starts: 0, align: false, anew: 0, ..Options::default() };
-        estimate(&engine, model, &[masked(wide)], &options, |_| Ok(())).unwrap().remove(0)
+        let is_object = |pixel: usize| exact.coverage.as_ref().unwrap()[pixel] == 1.0;
+        let is_in_mask = |pixel: usize| (0..=wide).any(|k| pixel >= k * side && is_object(pixel - k * side));
+        let coverage = Some((0..side * side).map(|pixel| f32::from(u8::from(is_in_mask(pixel)))).collect());
+        let is_shadow = |pixel: usize| is_in_mask(pixel) && !is_object(pixel);
+        let colour = |value: usize| if is_shadow(value / 3) { [-0.5, -0.6, -0.7][value % 3] } else { exact.rgb[value] };
+        let rgb = (0..3 * side * side).map(colour).collect();
+        with_outlines(&model, Query { rgb, coverage, ..exact.clone() }, phases)
     };
-    let (steps, outlines) = ((10, false), (5, true));
-    let [without, with] = [[steps, steps].as_slice(), &[steps, outlines, steps]].map(|phases| found(3, phases));
+    let [without, with] = [[STEPS, STEPS].as_slice(), &[STEPS, OUTLINES, STEPS]].map(|phases| found(3, phases));
     println!("{:.4} {:.4} {:?}", without.loss, with.loss, with.outline);
     assert_eq!(with.outline.unwrap().cut, DVec2::new(0.0, 3.0));
     assert!(with.loss < 0.4 * without.loss, "{} {}", without.loss, with.loss);
-    assert_eq!(found(0, &[steps, outlines]).outline.unwrap().cut, DVec2::ZERO);
+    assert_eq!(found(0, &[STEPS, OUTLINES]).outline.unwrap().cut, DVec2::ZERO);
 }
 
 /// Where a mask lacks the lower part of the object, nothing below it counts; the pose is that of the whole.
 #[test]
 fn a_missing_part_is_not_taken_for_background() {
-    const SIDE: u32 = 28;
     const MISSING: usize = 3;
-    let (ref model, instance, intrinsics) = shipped_forklift();
-    let engine = Engine::cpu();
-    let truth = camera::fixed24(1.3)[2];
-    let shown = Renderer::new(&engine, model, 1, SIDE, SIDE).unwrap().render(&[instance], &[(truth, intrinsics)], 0).unwrap();
-    let side = SIDE as usize;
-    let is_object = |pixel: usize| shown.rgb[3 * pixel..][..3].iter().any(|colour| *colour < 0.9);
+    let (model, exact, truth) = forklift_cut_out();
+    let side = exact.width as usize;
+    let is_object = |pixel: usize| exact.coverage.as_ref().unwrap()[pixel] == 1.0;
     let last = (0..side * side).filter(|&pixel| is_object(pixel)).max().unwrap() / side;
     let found = |missing: usize, phases: &[(u32, bool)]| {
         let is_in_mask = |pixel: usize| is_object(pixel) && pixel / side + missing <= last;
-        let coverage = (0..side * side).map(|pixel| f32::from(u8::from(is_in_mask(pixel)))).collect();
-        let colour = |value: usize| if is_in_mask(value / 3) { shown.rgb[value].clamp(-1.0, 1.0) } else { 1.0 };
+        let coverage = Some((0..side * side).map(|pixel| f32::from(u8::from(is_in_mask(pixel)))).collect());
+        let colour = |value: usize| if is_in_mask(value / 3) { exact.rgb[value] } else { 1.0 };
         let rgb = (0..3 * side * side).map(colour).collect();
-        let starts = vec![DMat4::from_rotation_z(0.05) * truth];
-        let (width, height, outline) = (SIDE, SIDE, Outline::AS_GIVEN);
-        let query = Query { instance, rgb, weights: None, coverage: Some(coverage), outline, width, height, intrinsics, starts };
-        let phase = |&(steps, outlines)| Phase { steps, stride: 1, keep: 1, light: false, outlines };
-        let phases = phases.iter().map(phase).collect();
-        let options = Options { phases, min_starts: 0, align: false, anew: 0, ..Options::default() };
-        let estimate = estimate(&engine, model, &[query], &options, |_| Ok(())).unwrap().remove(0);
-        let (degrees, off) = camera::pose_error(&estimate.pose.to_matrix(), &truth);
-        (estimate, degrees, off)
+        with_outlines(&model, Query { rgb, coverage, ..exact.clone() }, phases)
     };
-    let (steps, outlines) = ((10, false), (5, true));
-    let [(without, ..), (with, degrees, off)] =
-        [[steps, steps].as_slice(), &[steps, outlines, steps]].map(|phases| found(MISSING, phases));
+    let [without, with] = [[STEPS, STEPS].as_slice(), &[STEPS, OUTLINES, STEPS]].map(|phases| found(MISSING, phases));
+    let (degrees, off) = camera::pose_error(&with.pose.to_matrix(), &truth);
     println!("{:.4} {:.4} {:?}, {degrees}° {off}", without.loss, with.loss, with.outline);
     assert_eq!(with.outline.unwrap().missing, DVec2::new(0.0, 12.0));
     assert!(with.loss < 0.2 * without.loss && degrees < 1.0 && off < 0.02, "{} {}: {degrees}° {off}", without.loss, with.loss);
@@ -403,7 +400,7 @@ fn a_missing_part_is_not_taken_for_background() {
     let counting = missing.iter().filter(|&&pixel| weights[pixel] > 0.0).count();
     assert!(left.iter().all(|&pixel| weights[pixel] == 1.0) && 5 * counting < missing.len(), "{counting} of {}", missing.len());
     assert!(without.weights.is_none());
-    assert_eq!(found(0, &[steps, outlines]).0.outline.unwrap().missing, DVec2::ZERO);
+    assert_eq!(found(0, &[STEPS, OUTLINES]).outline.unwrap().missing, DVec2::ZERO);
 }
 
 /// Where the coverage is known, dilations of it are tried; another picture beside it, or hypotheses that wait, are none the worse for it.
