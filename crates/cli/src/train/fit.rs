@@ -17,7 +17,7 @@ use image::RgbImage;
 use indicatif::{HumanDuration, ProgressBar};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use sigma_srn::{Engine, Losses, Metadata, Model, Random, Train, Trainer, stream, write_atomically};
+use sigma_srn::{Engine, Losses, Metadata, Model, Random, Renderer, Train, Trainer, stream, write_atomically};
 use srn_data::{Dataset, SrnSet, pixels, sheet};
 
 use super::{Changeable, ForGood, Preset, Settings, Shown, psnr_of_each, render, training_batch};
@@ -117,8 +117,8 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     if trainer.steps() > settings.steps {
         return Err(format!("--steps {}: the run has done {} already", settings.steps, trainer.steps()).into());
     }
-    // Whether there is memory for that, too, is found out before anything is written.
-    look(&engine, trainer.model()?, &watched, settings.side, orbit_radius)?;
+    // Whether there is memory to look at views, too, is found out before anything is written.
+    Renderer::new(&engine, trainer.model()?, watched.len() as u32, settings.side, settings.side)?;
     fs::create_dir_all(run).map_err(|error| format!("{}: {error}", run.display()))?;
     if !is_resumed {
         held = Some(lock(run)?);
