@@ -1,6 +1,7 @@
 //! What the binaries share: choice of the executor, exit codes, data sets as the network takes them, progress.
 
 use std::error::Error;
+use std::fs::{File, TryLockError};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -194,7 +195,17 @@ pub fn create_dir(path: &Path) -> Result<()> {
 /// Permissions say little of who may write where; a file does.
 fn try_to_write(folder: &Path) -> std::io::Result<()> {
     let probe = folder.join(format!(".sigma-srn-{}", std::process::id()));
-    std::fs::File::create(&probe).and_then(|_| std::fs::remove_file(&probe))
+    File::create(&probe).and_then(|_| std::fs::remove_file(&probe))
+}
+
+/// Takes a lock that one process at a time holds, until the file is dropped; an error that says `busy` where another has it. The file stays, and is empty.
+pub fn lock(path: &Path, busy: &str) -> Result<File> {
+    let file = File::create(path).map_err(|error| format!("{}: {error}", path.display()))?;
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => Err(busy.into()),
+        // Not every file system has locks.
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
+    }
 }
 
 /// Prints a result on stdout; a full disk or a closed pipe is an error, not a panic.

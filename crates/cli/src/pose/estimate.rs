@@ -47,7 +47,7 @@ pub struct Estimate {
     mask: Vec<PathBuf>,
     /// Where to start: `around84`, all around; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file
     /// with 16 numbers per line, or in four lines, a `world_from_camera` each. Default: `neighbor4` with --rough, else `around84`. Where there are fewer than
-    /// 84, six more are tried around each, turned by 40° about the object; they have the numbers that follow, from 0 on.
+    /// 84, six more are tried around each, turned by 40° about the object; numbers of starts count from 0, the given ones first.
     #[arg(long, value_name = "around84|fixed24|neighbor4|FILE")]
     starts: Option<Starts>,
     /// Roughly known pose: a pose file, or `auto`, the one in the picture's SRN folder. Once, or once per picture.

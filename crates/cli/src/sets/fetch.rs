@@ -1,6 +1,6 @@
 //! `sigma-data fetch`: the packages of the public sets, by the system's own clients, into the user's cache directory.
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io::{self, Cursor, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -11,7 +11,7 @@ use indicatif::ProgressBar;
 use sha2::{Digest, Sha256};
 
 use super::{Client, Package, Set, archive};
-use crate::common::{Result, bytes_progress, print};
+use crate::common::{Result, bytes_progress, lock, print};
 
 /// Flags of `sigma-data fetch`.
 #[derive(Args, Debug)]
@@ -90,13 +90,7 @@ impl Cache {
     /// Downloads, verifies and unpacks a package. Returns its folder and the number of files.
     fn fetch(&self, package: &Package) -> Result<(PathBuf, usize)> {
         make_folder(&self.root)?;
-        let lock = self.root.join("lock");
-        let lock = File::create(&lock).map_err(|error| about(&lock, error))?;
-        match lock.try_lock() {
-            Err(TryLockError::WouldBlock) => return Err(format!("{}: another fetch is at work", self.root.display()).into()),
-            // Not every file system has locks.
-            Ok(()) | Err(TryLockError::Error(_)) => {}
-        }
+        let _held = lock(&self.root.join("lock"), &format!("{}: another fetch is at work", self.root.display()))?;
         let release = package.release()?;
         let folder = self.folder(package, &release.version);
         let archive = self.archive(package, &release, &folder)?;

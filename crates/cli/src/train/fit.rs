@@ -5,7 +5,7 @@
 //! checkpoint; on resuming, lines behind the checkpoint's step are dropped, and those steps are done again. `lock` is held by who trains.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -198,15 +198,9 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     Ok(true)
 }
 
-/// Only one process trains a run. The file stays, and is empty.
+/// Only one process trains a run.
 fn lock(run: &Path) -> Result<File> {
-    let path = run.join("lock");
-    let file = File::create(&path).map_err(|error| format!("{}: {error}", path.display()))?;
-    match file.try_lock() {
-        Err(TryLockError::WouldBlock) => Err(format!("{}: another fit is training it", run.display()).into()),
-        // Not every file system has locks.
-        Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
-    }
+    common::lock(&run.join("lock"), &format!("{}: another fit is training it", run.display()))
 }
 
 /// Reads a set, the first `views` of each instance.
