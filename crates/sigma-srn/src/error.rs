@@ -53,6 +53,14 @@ pub enum Error {
         /// What is wrong, with both numbers.
         what: String,
     },
+    /// An image whose pose is looked for, or what is known of it, that makes no sense.
+    #[error("image {number}: {what}")]
+    Query {
+        /// Its number among the queries, from 0.
+        number: usize,
+        /// What is wrong.
+        what: String,
+    },
     /// The memory budget is too small for even the smallest portions of the work.
     #[error("the memory budget of {budget} bytes is too small: this work needs {needed}")]
     Budget {

@@ -74,6 +74,8 @@ impl Search {
         mut observe: impl FnMut(Progress) -> Result<(), Error>,
     ) -> Result<Vec<Found>, Error> {
         let (first, others) = self.tries()?;
+        // Later ones see a query alone, and would call it the first.
+        self.tries.iter().try_for_each(|options| check(model, queries, options))?;
         let began = Instant::now();
         let (model, queries) = &at_work(model, queries)?;
         let before = began.elapsed().as_secs_f64() / queries.len() as f64;
@@ -136,7 +138,6 @@ impl Search {
         at_once: usize,
         mut observe: impl FnMut(Progress) -> Result<(), Error>,
     ) -> Result<Vec<Found>, Error> {
-        check(model, queries, options)?;
         let mut all = Vec::new();
         let portions = portions(queries, options, at_once);
         let (mut left, mut before) = (portions.len() as u32, 0);
@@ -264,8 +265,16 @@ mod tests {
         assert_eq!((step, query), (steps, Some(2)));
 
         let wrong = [of(0.9), Query { starts: vec![], ..of(0.9) }];
-        let error = search.once(&engine, &model, &wrong, options, 1, |_| Ok(())).unwrap_err().to_string();
-        assert!(error.contains("image 1"), "{error}");
+        let error = search.run(&engine, &model, &wrong, |_| Ok(())).unwrap_err();
+        assert!(matches!(error, Error::Query { number: 1, .. }), "{error}");
+        // A later try, whose rays see nothing that counts, says it of the right image before the first begins.
+        let mut weights = vec![0.0; 64];
+        weights[0] = 1.0;
+        let dark = [of(0.9), Query { weights: Some(weights), ..of(0.9) }];
+        let with_stride = |stride| options.clone().with_stride(stride);
+        let search = Search { tries: vec![with_stride(1), with_stride(2)], accept: None };
+        let error = search.run(&engine, &model, &dark, |_| panic!("it has begun")).unwrap_err();
+        assert!(matches!(error, Error::Query { number: 1, .. }), "{error}");
     }
 
     #[test]

@@ -260,12 +260,7 @@ pub fn run(
     let queries: Vec<_> = pictures.iter().zip(starts).map(|(picture, starts)| query(picture, side, starts)).collect();
     with_cooperative_said(engine, || {
         search.run(engine, model, &queries, observe).map_err(|error| match error {
-            // The library numbers what it is given.
-            Error::Input { input, what } => {
-                let number = input.strip_prefix("image ").and_then(|number| number.parse::<usize>().ok());
-                let name = number.and_then(|number| Some(pictures.get(number)?.name.clone()));
-                Error::Input { input: name.unwrap_or(input), what }.into()
-            }
+            Error::Query { number, what } => Error::Input { input: pictures[number].name.clone(), what }.into(),
             error => error.into(),
         })
     })

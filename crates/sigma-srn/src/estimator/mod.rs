@@ -471,11 +471,11 @@ pub(crate) fn check(model: &Model, queries: &[Query], options: &Options) -> Resu
         }
     }
     for (number, query) in queries.iter().enumerate() {
-        let input = |what| Error::Input { input: format!("image {number}"), what };
-        query.check(model, options).map_err(input)?;
+        let wrong = |what| Error::Query { number, what };
+        query.check(model, options).map_err(wrong)?;
         let &Query { width, height, .. } = query;
         if [width, height] != [first.width, first.height] {
-            return Err(input(format!("{width} × {height}, but the first is {} × {}", first.width, first.height)));
+            return Err(wrong(format!("{width} × {height}, but the first is {} × {}", first.width, first.height)));
         }
     }
     Ok(())
