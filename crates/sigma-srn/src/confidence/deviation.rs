@@ -90,7 +90,9 @@ impl Estimate {
 
     /// Covariance of the motion from the estimated pose of this instance to the true one; `None` where there is no [`Estimate::shape`].
     pub fn covariance(&self, instance: &str, calibration: &Calibration) -> Option<Matrix6> {
-        let of_picture = if self.is_without_outline { WITHOUT_OUTLINE } else { 1.0 };
+        // Second derivatives know of the pixels that are missing where a part is hidden, but not of all: errors of the model average over fewer, and
+        // what is left says less of how far away it is. So much covers them (`docs/accuracy.md`).
+        let of_picture = if self.is_without_outline { WITHOUT_OUTLINE } else { 1.0 / self.in_sight };
         let size = of_picture * calibration.sizes.get(instance).copied().unwrap_or(1.0);
         let mixed = mixed(&self.shape()?, calibration.curvature, &calibration.floor_of(self));
         let Some(outline) = self.outline else { return Some(mixed.map(|row| row.map(|entry| size * entry))) };
@@ -275,6 +277,19 @@ mod tests {
         assert_eq!(variances(Some(Seen { distance: 5.2, extent: 0.1 })), [1.0; 3]);
         let known = Calibration { seen: Some(Seen { distance: 1.3, extent: 0.9 }), ..known };
         assert_eq!([0.4, 0.5].map(|extent| known.is_small(extent)), [true, false]);
+    }
+
+    #[test]
+    fn what_is_half_hidden_is_less_sure() {
+        let at = estimate(look_at_origin(DVec3::new(0.0, 1.3, 0.0)));
+        let variances = |is_without_outline, in_sight| {
+            let estimate = Estimate { is_without_outline, in_sight, ..at.clone() };
+            let covariance = estimate.covariance("", &calibration(0.0, [1e-4; 6])).unwrap();
+            [0, 5].map(|k| (1e4 * covariance[k][k]).round())
+        };
+        assert_eq!([1.0, 0.5, 0.25].map(|in_sight| variances(false, in_sight)), [[1.0; 2], [2.0; 2], [4.0; 2]]);
+        // What hides all around it has a factor of its own.
+        assert_eq!(variances(true, 0.5), [5.0; 2]);
     }
 
     #[test]

@@ -77,6 +77,7 @@ mod tests {
             light: None,
             outline: None,
             is_without_outline: false,
+            in_sight: 1.0,
             target: vec![],
             weights: None,
             width: 64,

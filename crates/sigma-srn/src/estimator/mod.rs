@@ -74,6 +74,8 @@ pub struct Estimate {
     pub outline: Option<Outline>,
     /// Whether a mask hides all around the object, so that nothing but its colours say how large it is.
     pub is_without_outline: bool,
+    /// The part that counts of the disc around the object in the picture, as wide as its diagonal; 1 where nothing hides any of it.
+    pub in_sight: f64,
     /// The image as it was compared at the end, with this outline and in the model's light `[height, width, 3]`.
     pub target: Vec<f32>,
     /// How much each pixel of it counted then `[height, width]`: not at all where a part of the object may be missing in the mask. `None`: all the same.
@@ -359,7 +361,8 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         let extent = query.intrinsics.fx / (pose.distance() * f64::from(width));
         let ranking = own.iter().map(ranked).collect();
         let is_without_outline = query.coverage.is_some() && !query.has_outline();
-        Estimate { pose, loss, curvature, light, outline, is_without_outline, target, weights, width, extent, ranking }
+        let in_sight = query.in_sight(&pose, weights.as_deref());
+        Estimate { pose, loss, curvature, light, outline, is_without_outline, in_sight, target, weights, width, extent, ranking }
     }
 
     /// Takes hypotheses through a phase, those of a query one after the other, the best first. What second derivatives say at its end is found out where

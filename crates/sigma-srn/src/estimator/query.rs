@@ -7,13 +7,16 @@ use glam::{DMat4, DVec2};
 
 use super::align::hidden_side;
 use super::options::{Options, Phase};
-use crate::camera::Intrinsics;
+use crate::camera::{Intrinsics, Pose6};
 use crate::mask::{Outline, has_outline, known, outlines, with_outline};
 use crate::model::Model;
 use crate::pixel_grid;
 
 /// How far starts are turned that the search adds. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
 const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
+
+/// Less than this of an object in sight is taken for this much: of what it says of a pose nothing is known.
+const LEAST_IN_SIGHT: f64 = 0.1;
 
 /// An image whose camera pose is wanted.
 #[derive(Clone, Debug)]
@@ -80,6 +83,20 @@ impl Query {
     /// Whether the mask has an outline that may be wrong.
     pub(crate) fn has_outline(&self) -> bool {
         self.coverage.as_ref().is_some_and(|coverage| has_outline(coverage, self.weights.as_deref()))
+    }
+
+    /// See [`Estimate::in_sight`](super::Estimate::in_sight): by how much each pixel counts.
+    pub(crate) fn in_sight(&self, pose: &Pose6, weights: Option<&[f32]>) -> f64 {
+        let Some(weights) = weights else { return 1.0 };
+        let Intrinsics { fx, fy, cx, cy, pixel_center } = self.intrinsics;
+        let centre = pose.to_matrix().inverse().w_axis;
+        let is_inside = |(u, v): (u32, u32)| {
+            let [x, y] = [(u, fx, cx), (v, fy, cy)].map(|(at, f, c)| (f64::from(at) + pixel_center - c) / f);
+            (x * centre.z - centre.x).hypot(y * centre.z - centre.y) < 0.5
+        };
+        let inside: Vec<f64> =
+            zip(self.rays(1), weights).filter(|(at, _)| is_inside(*at)).map(|(_, weight)| f64::from(weight.min(1.0))).collect();
+        if inside.is_empty() { 1.0 } else { (inside.iter().sum::<f64>() / inside.len() as f64).max(LEAST_IN_SIGHT) }
     }
 
     /// On which side something is before the object, see [`hidden_side`].
@@ -195,6 +212,35 @@ mod tests {
             assert!((degrees - 40.0).abs() < 1e-6 && (near - far).abs() < 1e-12, "{k}: {degrees}°");
             assert!(added[..k].iter().all(|other| crate::camera::pose_error(pose, other).0 > 40.0), "{k}");
         }
+    }
+
+    #[test]
+    fn of_an_object_as_much_is_in_sight_as_counts_of_the_disc_around_it() {
+        let query = Query {
+            instance: 0,
+            rgb: vec![1.0; 3 * 64 * 64],
+            weights: None,
+            coverage: None,
+            outline: Outline::AS_GIVEN,
+            width: 64,
+            height: 64,
+            intrinsics: Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.5 },
+            starts: vec![],
+        };
+        let pose = Pose6::from_matrix(&crate::camera::look_at_origin(glam::DVec3::new(0.0, 1.3, 0.0)));
+        let in_sight = |counts: &dyn Fn(f64, f64) -> bool| {
+            let weight = |pixel: u32| f32::from(counts(f64::from(pixel % 64) - 31.5, f64::from(pixel / 64) - 31.5));
+            query.in_sight(&pose, Some(&(0..64 * 64).map(weight).collect::<Vec<_>>()))
+        };
+        assert_eq!(query.in_sight(&pose, None), 1.0);
+        // The disc has a radius of 0.5 · 74.4 / 1.3 pixels, 28.6.
+        assert_eq!([28.5, 27.0].map(|radius| in_sight(&|x, y| x.hypot(y) < radius) == 1.0), [false, false]);
+        assert_eq!(in_sight(&|x, y| x.hypot(y) < 28.7), 1.0);
+        assert_eq!([in_sight(&|x, _| x > 0.0), in_sight(&|_, y| y < 0.0)], [0.5; 2]);
+        assert_eq!(in_sight(&|x, y| x.hypot(y) > 28.7), LEAST_IN_SIGHT);
+        // Beside the picture is no disc.
+        let aside = crate::camera::look_at_origin(glam::DVec3::new(0.0, 1.3, 0.0)) * DMat4::from_rotation_y(1.5);
+        assert_eq!(query.in_sight(&Pose6::from_matrix(&aside), Some(&[0.0; 64 * 64])), 1.0);
     }
 
     #[test]
