@@ -48,9 +48,12 @@ pub struct Settings {
     pub steps: u64,
     /// Learning rate of Adam.
     pub lr: f64,
-    /// Factor on the learning rate in the last part.
+    /// Steps over which the learning rate rises to it.
+    #[serde(default)]
+    pub warm_up: u64,
+    /// Factor on the learning rate at the last step.
     pub decay: f64,
-    /// The last step at the full learning rate.
+    /// The last step at the full learning rate; it falls evenly after that.
     pub decay_from: u64,
     /// Decides everything random.
     pub seed: u64,
@@ -147,13 +150,16 @@ pub struct Changeable {
     /// Number of steps [14000, paper 100000].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     steps: Option<u64>,
-    /// Learning rate of Adam [5e-4, paper 5e-5].
+    /// Learning rate of Adam [2e-3, paper 5e-5].
     #[arg(long, value_name = "RATE", value_parser = positive)]
     lr: Option<f64>,
-    /// Factor on the learning rate in the last part [0.1, paper 1].
+    /// Steps over which the learning rate rises to it [100, paper 0].
+    #[arg(long, value_name = "STEPS")]
+    warm_up: Option<u64>,
+    /// Factor on the learning rate at the last step, towards which it falls evenly [0.005, paper 1].
     #[arg(long, value_name = "FACTOR", value_parser = positive)]
     decay: Option<f64>,
-    /// The last step at the full learning rate [4/5 of the steps; a resumed run keeps it].
+    /// The last step at the full learning rate [0].
     #[arg(long, value_name = "STEP")]
     decay_from: Option<u64>,
 }
@@ -209,8 +215,9 @@ impl Settings {
             rays: 0,
             detail: if is_paper { 0.0 } else { 0.5 },
             steps: if is_paper { 100_000 } else { 14_000 },
-            lr: if is_paper { 5e-5 } else { 5e-4 },
-            decay: if is_paper { 1.0 } else { 0.1 },
+            lr: if is_paper { 5e-5 } else { 2e-3 },
+            warm_up: if is_paper { 0 } else { 100 },
+            decay: if is_paper { 1.0 } else { 0.005 },
             decay_from: 0,
             seed: 0,
             log_every: 50,
@@ -239,13 +246,12 @@ impl Settings {
             }
         }
         settings.change(changeable);
-        settings.decay_from = changeable.decay_from.unwrap_or(settings.steps * 4 / 5);
         Ok(settings)
     }
 
     /// Takes the flags that were given.
     pub fn change(&mut self, flags: &Changeable) {
-        take!(self, flags: data, validation, steps, lr, decay, decay_from);
+        take!(self, flags: data, validation, steps, lr, warm_up, decay, decay_from);
     }
 
     /// Reads the `config.json` of a run.
@@ -262,7 +268,9 @@ impl Settings {
 
     /// Learning rate of a step, counted from 1.
     pub fn learning_rate(&self, step: u64) -> f64 {
-        if step > self.decay_from { self.lr * self.decay } else { self.lr }
+        let risen = if step < self.warm_up { step as f64 / self.warm_up as f64 } else { 1.0 };
+        let fallen = step.saturating_sub(self.decay_from) as f64 / self.steps.saturating_sub(self.decay_from).max(1) as f64;
+        risen * self.lr * (1.0 + (self.decay - 1.0) * fallen)
     }
 
     /// Sizes of the model.
