@@ -303,7 +303,7 @@ fn adapt_fits_codes_then_networks() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let (run, new) = (at("run"), at("new.safetensors"));
-    succeed(&format!("fit --data {TRAIN} --out {} {TINY} --steps 100 --lr 2e-3 --executor cpu", run.display()));
+    succeed(&format!("fit --data {TRAIN} --out {} {TINY} --steps 100 --warm-up 10 --executor cpu", run.display()));
     let old = run.join("model.safetensors");
     let adapt = format!("adapt --model {} --data {TEST}/seat --executor cpu --steps 40 --network-steps 0 --out", old.display());
     let fitted = |args: &str| -> [f64; 2] {

@@ -352,7 +352,7 @@ fn limits(known: &[Known], lost: &[Known]) -> Limits {
     // By how much the trusted poses that were found could leave more unexplained: those of poorer pictures will.
     let room = |limits: &Limits| {
         let of = |known: &Known| (limits.unexplained / known.unexplained).min(limits.above_truth / known.over_truth);
-        found().filter(|known| limits.trust(known)).map(of).fold(f64::INFINITY, f64::min)
+        found().filter(|known| limits.trust(known)).map(of).min_by(f64::total_cmp).unwrap_or(0.0)
     };
     let mut best = (score(&loosest), room(&loosest), loosest);
     for unexplained in between(&|known| known.unexplained, loosest.unexplained) {
