@@ -1,6 +1,6 @@
 //! How poses are estimated: phases, and what each is for.
 
-use std::iter::zip;
+use std::iter::{self, zip};
 
 use crate::descent::{Loss, Method};
 
@@ -22,6 +22,9 @@ pub struct Phase {
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`](crate::Query::coverage) is known: see [`Light`](crate::Light). From wrong
     /// poses the light looks wrong, too.
     pub light: bool,
+    /// Whether each hypothesis begins where it looks best: at its pose, or turned from it by 15° about the object, to either side about each axis of the camera. Of
+    /// a sharp model a descent finds the way from less far than starts are apart.
+    pub turns: bool,
     /// Whether outlines of masks are tried beside [`Query::outline`](crate::Query::outline), where [`Query::coverage`](crate::Query::coverage) is known, with the best `keep` hypotheses:
     /// dilated and eroded by up to two pixels, and with three cut away on one side. Later phases compare with what leaves the least loss, see
     /// [`Estimate::outline`](crate::Estimate::outline). Other hypotheses and other images wait: none is dropped for it.
@@ -69,20 +72,29 @@ impl Default for Options {
 }
 
 impl Options {
-    /// BFGS: a look at all starts, steps for the most promising ones on few rays, then for the best on more, and for the best few on
+    /// BFGS: a look at all starts, a closer one around the best, steps for the most promising ones on few rays, then for the best on more, and for the best few on
     /// all, until they stand still: the loss has minima side by side. Then once more with new second derivatives: where a valley is flat and
     /// full of kinks, those that steps have learnt leave a pose a tenth of a degree before its end. These two make up for the light, and before them masks
     /// are tried with other outlines. And on so for those that have not arrived: most have, in a number of steps that would be too small for some.
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents) = match effort {
-            Effort::Fast => (84, [(6, 6), (6, 2), (5, 1), (5, 1), (3, 1)]),
-            Effort::Normal => (84, [(8, 16), (8, 6), (6, 1), (16, 3), (6, 3)]),
-            Effort::Exhaustive => (168, [(10, 64), (10, 20), (6, 6), (18, 6), (6, 6)]),
+            Effort::Fast => (84, [(0, 12), (6, 6), (6, 2), (5, 1), (5, 1), (3, 1)]),
+            Effort::Normal => (84, [(0, 24), (8, 16), (8, 6), (6, 1), (16, 3), (6, 3)]),
+            Effort::Exhaustive => (168, [(0, 96), (10, 64), (10, 20), (6, 6), (18, 6), (6, 6)]),
         };
-        let mut phases = vec![Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, outlines: false }];
-        let phase = |((stride, light, outlines), (steps, keep))| Phase { steps, stride, keep, light, outlines };
-        let kinds = [(4, false, false), (2, false, false), (2, true, true), (1, true, false), (1, true, false)];
-        phases.extend(zip(kinds, descents).map(phase));
+        let look = Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, turns: false, outlines: false };
+        let closer_look = Phase { turns: true, ..look };
+        let in_the_light = |stride| Phase { stride, light: true, ..look };
+        let kinds = [
+            closer_look,
+            look,
+            Phase { stride: 2, ..look },
+            Phase { outlines: true, ..in_the_light(2) },
+            in_the_light(1),
+            in_the_light(1),
+        ];
+        let phase = |(kind, (steps, keep))| Phase { steps, keep, ..kind };
+        let phases = iter::once(look).chain(zip(kinds, descents).map(phase)).collect();
         Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, align: true, phases, anew: 6, seed: 0 }
     }
 
@@ -93,7 +105,7 @@ impl Options {
             method,
             min_starts: 0,
             align: false,
-            phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, outlines: false }],
+            phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, turns: false, outlines: false }],
             anew: 0,
             seed: 0,
         }
@@ -130,6 +142,7 @@ impl Options {
     pub fn without_culling(mut self) -> Self {
         self.align = false;
         self.min_starts = 0;
+        self.phases.retain(|phase| !phase.turns);
         self.phases.iter_mut().filter(|phase| !phase.outlines).for_each(|phase| phase.keep = usize::MAX);
         self
     }
@@ -164,9 +177,9 @@ mod tests {
         }
         let total = all(&default);
         assert_eq!(default.clone().with_steps(total), Options { anew: 0, ..default.clone() });
-        // A look at all starts, outlines, and the phase that has the step.
+        // A look at all starts and a closer one, outlines, and the phase that has the step.
         let one: Vec<(u32, u32)> = default.clone().with_steps(1).phases.iter().map(|phase| (phase.steps, phase.stride)).collect();
-        assert_eq!(one, [(0, 4), (0, 2), (1, 1)]);
+        assert_eq!(one, [(0, 4), (0, 4), (0, 2), (1, 1)]);
         assert_eq!(default.clone().with_steps(0).phases.len(), default.phases.len());
         let keeps = |options: &Options| options.phases.iter().map(|phase| (phase.steps, phase.keep)).collect::<Vec<_>>();
         assert_eq!(keeps(&Options::paper().with_culling()), [(60, usize::MAX), (240, 6)]);

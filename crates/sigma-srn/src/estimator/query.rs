@@ -12,8 +12,11 @@ use crate::mask::{Outline, has_outline, known, outlines, with_outline};
 use crate::model::Model;
 use crate::pixel_grid;
 
-/// How far starts are turned that the search adds. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
-const TURN: f64 = 40.0 * std::f64::consts::PI / 180.0;
+/// How far starts are turned that the search adds, in degrees. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
+pub(super) const TURN_DEG: f64 = 40.0;
+
+/// How many [`turned`] ones there are of a camera.
+pub(super) const TURNS: usize = 6;
 
 /// Less than this of an object in sight is taken for this much: of what it says of a pose nothing is known.
 const LEAST_IN_SIGHT: f64 = 0.1;
@@ -106,7 +109,8 @@ impl Query {
 
     /// The starts, and those that are added.
     pub(crate) fn all_starts(&self, options: &Options) -> Vec<DMat4> {
-        let around = (self.starts.len() < options.min_starts).then(|| self.starts.iter().flat_map(turned));
+        let around =
+            (self.starts.len() < options.min_starts).then(|| self.starts.iter().flat_map(|start| turned(start, TURN_DEG)));
         self.starts.iter().copied().chain(around.into_iter().flatten()).collect()
     }
 
@@ -114,7 +118,7 @@ impl Query {
     pub(crate) fn most_rays(&self, options: &Options) -> usize {
         let starts = self.all_starts(options).len();
         let rays = |phase: &Phase| {
-            let tried = if phase.outlines { outlines().count() } else { 1 };
+            let tried = if phase.outlines { outlines().count() } else { 1 } * if phase.turns { 1 + TURNS } else { 1 };
             tried * starts.min(phase.keep) * self.rays(phase.stride).count()
         };
         options.phases.iter().map(rays).max().unwrap_or(0)
@@ -189,11 +193,12 @@ impl Seen<'_> {
     }
 }
 
-/// A camera turned about the object by 40°, to either side about each of its axes.
-pub(super) fn turned(world_from_camera: &DMat4) -> impl Iterator<Item = DMat4> {
+/// A camera turned about the object, to either side about each of its axes.
+pub(super) fn turned(world_from_camera: &DMat4, degrees: f64) -> impl Iterator<Item = DMat4> {
     let axes = [world_from_camera.x_axis, world_from_camera.y_axis, world_from_camera.z_axis];
-    let turns =
-        axes.into_iter().flat_map(|axis| [-TURN, TURN].map(|angle| DMat4::from_axis_angle(axis.truncate().normalize(), angle)));
+    let turns = axes.into_iter().flat_map(move |axis| {
+        [-degrees, degrees].map(|angle| DMat4::from_axis_angle(axis.truncate().normalize(), angle.to_radians()))
+    });
     turns.map(|turn| turn * *world_from_camera)
 }
 
@@ -204,7 +209,7 @@ mod tests {
     #[test]
     fn added_starts_are_40_degrees_away_on_the_same_sphere() {
         let start = crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
-        let added: Vec<DMat4> = turned(&start).collect();
+        let added: Vec<DMat4> = turned(&start, TURN_DEG).collect();
         assert_eq!(added.len(), 6);
         for (k, pose) in added.iter().enumerate() {
             let (degrees, _) = crate::camera::pose_error(pose, &start);
@@ -246,7 +251,7 @@ mod tests {
     #[test]
     fn no_added_start_is_the_pose_that_others_were_turned_away_from() {
         let truth = crate::camera::look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
-        for start in crate::camera::neighbor4(&truth).iter().flat_map(turned) {
+        for start in crate::camera::neighbor4(&truth).iter().flat_map(|start| turned(start, TURN_DEG)) {
             let (degrees, _) = crate::camera::pose_error(&start, &truth);
             assert!(degrees > 5.0, "{degrees}°");
         }
