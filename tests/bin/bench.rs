@@ -413,7 +413,7 @@ impl Bench<'_> {
             outline: Outline::AS_GIVEN,
             starts,
         };
-        let phases = vec![Phase { steps: 0, stride: 4, keep: 1, light: false, turns: false, outlines: false }];
+        let phases = vec![Phase { steps: 0, stride: 4, keep: 1, light: false, closer_look: false, outlines: false }];
         estimate(self.engine, self.model, &[query], &Options { phases, min_starts: 0, ..Options::default() }, |_| Ok(()))?;
         Ok(self.engine.cooperative_difference().unwrap_or(f64::NAN))
     }

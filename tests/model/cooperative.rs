@@ -26,7 +26,7 @@ fn found(engine: &Engine) -> (f64, f64) {
         outline: Outline::AS_GIVEN,
         starts,
     };
-    let phases = vec![Phase { steps: 30, stride: 1, keep: usize::MAX, light: false, turns: false, outlines: false }];
+    let phases = vec![Phase { steps: 30, stride: 1, keep: usize::MAX, light: false, closer_look: false, outlines: false }];
     let options =
         Options { method: Method::Bfgs { soft: 1.0, grain: 0.0 }, min_starts: 0, align: false, phases, anew: 0, seed: 0 };
     let estimate = estimate(engine, model, &[query], &options, |_| Ok(())).unwrap().remove(0);

@@ -101,7 +101,7 @@ impl Tracker {
 
     /// The next pose is near; what would have to be found from afar is searched for all around instead.
     fn near(&self) -> Result<Search, Error> {
-        let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, turns: false, outlines: false };
+        let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, closer_look: false, outlines: false };
         let phases = match (&self.before[..], self.rim) {
             // A look says whether it stands still or goes on.
             ([_, _, ..], _) => vec![phase(0, 4, 2), phase(3, 2, 1), phase(4, 1, 1)],

@@ -40,7 +40,7 @@ pub fn estimate_unseen(
     observe(0, ROUNDS + 1)?;
     let known: Vec<Query> = (0..model.layout.instances).map(|instance| Query { instance, ..query.clone() }).collect();
     // A code says what colours an object has.
-    let phase = |steps, stride, keep| Phase { steps, stride, keep, light: false, turns: false, outlines: false };
+    let phase = |steps, stride, keep| Phase { steps, stride, keep, light: false, closer_look: false, outlines: false };
     // The coarsest look that still sees something of the image.
     let coarse = (query.width.min(query.height) / 8).max(1);
     let options = |phases| Options { phases, anew: 0, min_starts: 0, align: false, seed, ..Options::default() };

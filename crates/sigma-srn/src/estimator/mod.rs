@@ -14,7 +14,7 @@ use serde::Serialize;
 use self::align::align;
 pub use self::options::{Effort, Options, Phase};
 pub use self::query::Query;
-use self::query::{TURN_DEG, TURNS, turned};
+use self::query::{CLOSER_LOOKS, TURN_DEG, closer_looks, turned};
 use self::targets::prepare;
 use crate::Error;
 use crate::camera::Pose6;
@@ -29,9 +29,6 @@ use crate::random::{initial_depths, stream};
 /// How far apart two hypotheses are at most that have met: a turn about each axis (rad) and a shift along it (object units), a tenth of a pixel
 /// of 64. What is left of the search takes both to the same minimum.
 const MET: f64 = 1e-3;
-
-/// How far from a start a closer look goes, see [`Phase::turns`]: half as far as those of `around84` are apart.
-const CLOSER_DEG: f64 = 15.0;
 
 /// How many times the loss of the best hypothesis a rival may have to go on beside it. A search that has not ended exaggerates: of the steering part's
 /// `000018` the right pose stands at 1.6 times the loss of the one turned by 180° where three go on, and ends at 0.7 times.
@@ -245,14 +242,14 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
         if running.is_empty() {
             return Ok(rest);
         }
-        if phase.turns {
-            running = running.iter().flat_map(with_turns).collect();
+        if phase.closer_look {
+            running = running.iter().flat_map(looked_at_closer).collect();
         }
         let entered = running.clone();
         self.follow(phase, Some(number) == self.last, &mut running)?;
-        if phase.turns {
+        if phase.closer_look {
             let best = |tried: &[Hypothesis]| tried.iter().copied().min_by(|a, b| a.loss.total_cmp(&b.loss));
-            running = running.chunks(1 + TURNS).filter_map(best).collect();
+            running = running.chunks(CLOSER_LOOKS).filter_map(best).collect();
         }
         if phase.outlines {
             let mut closer = self.with_closer_outlines(&running, &entered);
@@ -426,11 +423,10 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
     }
 }
 
-/// A hypothesis, and those that a closer look at it tries, see [`Phase::turns`].
-fn with_turns(hypothesis: &Hypothesis) -> Vec<Hypothesis> {
-    let matrix = hypothesis.pose.to_matrix();
+/// A hypothesis at each pose that a closer look at it tries, see [`Phase::closer_look`].
+fn looked_at_closer(hypothesis: &Hypothesis) -> Vec<Hypothesis> {
     let at = |matrix: DMat4| Hypothesis { pose: Pose6::from_matrix(&matrix), ..*hypothesis };
-    iter::once(*hypothesis).chain(turned(&matrix, CLOSER_DEG).map(at)).collect()
+    closer_looks(&hypothesis.pose.to_matrix()).map(at).collect()
 }
 
 /// Those that went through all phases, of queries that have not arrived, see [`Options::anew`]; and all others.

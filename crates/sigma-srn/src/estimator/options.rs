@@ -22,9 +22,9 @@ pub struct Phase {
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`](crate::Query::coverage) is known: see [`Light`](crate::Light). From wrong
     /// poses the light looks wrong, too.
     pub light: bool,
-    /// Whether each hypothesis begins where it looks best: at its pose, or turned from it by 15° about the object, to either side about each axis of the camera. Of
-    /// a sharp model a descent finds the way from less far than starts are apart.
-    pub turns: bool,
+    /// Whether each hypothesis begins where it looks best: at its pose, turned from it by 15° about the object, to either side about each axis of the camera, or an eighth
+    /// nearer or farther away. Of a sharp model a descent finds the way from less far than starts are apart.
+    pub closer_look: bool,
     /// Whether outlines of masks are tried beside [`Query::outline`](crate::Query::outline), where [`Query::coverage`](crate::Query::coverage) is known, with the best `keep` hypotheses:
     /// dilated and eroded by up to two pixels, and with three cut away on one side. Later phases compare with what leaves the least loss, see
     /// [`Estimate::outline`](crate::Estimate::outline). Other hypotheses and other images wait: none is dropped for it.
@@ -82,8 +82,8 @@ impl Options {
             Effort::Normal => (84, [(0, 24), (8, 16), (8, 6), (6, 1), (16, 3), (6, 3)]),
             Effort::Exhaustive => (168, [(0, 96), (10, 64), (10, 20), (6, 6), (18, 6), (6, 6)]),
         };
-        let look = Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, turns: false, outlines: false };
-        let closer_look = Phase { turns: true, ..look };
+        let look = Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, closer_look: false, outlines: false };
+        let closer_look = Phase { closer_look: true, ..look };
         let in_the_light = |stride| Phase { stride, light: true, ..look };
         let kinds = [
             closer_look,
@@ -105,7 +105,7 @@ impl Options {
             method,
             min_starts: 0,
             align: false,
-            phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, turns: false, outlines: false }],
+            phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, closer_look: false, outlines: false }],
             anew: 0,
             seed: 0,
         }
@@ -142,7 +142,7 @@ impl Options {
     pub fn without_culling(mut self) -> Self {
         self.align = false;
         self.min_starts = 0;
-        self.phases.retain(|phase| !phase.turns);
+        self.phases.retain(|phase| !phase.closer_look);
         self.phases.iter_mut().filter(|phase| !phase.outlines).for_each(|phase| phase.keep = usize::MAX);
         self
     }

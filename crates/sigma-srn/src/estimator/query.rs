@@ -1,7 +1,7 @@
 //! What is wanted: an image with what is known of it, and where the search for its pose starts.
 
 use std::borrow::Cow;
-use std::iter::zip;
+use std::iter::{self, zip};
 
 use glam::{DMat4, DVec2};
 
@@ -15,8 +15,14 @@ use crate::pixel_grid;
 /// How far starts are turned that the search adds, in degrees. Not the 30° of `neighbor4`: one of them would be turned back to where it came from.
 pub(super) const TURN_DEG: f64 = 40.0;
 
-/// How many [`turned`] ones there are of a camera.
-pub(super) const TURNS: usize = 6;
+/// How far a closer look turns a camera, in degrees: half as far as those of `around84` are apart.
+const CLOSER_DEG: f64 = 15.0;
+
+/// By which factors it moves one nearer, and farther away: where a distance is a fifth wrong, a descent then begins less than a tenth off.
+const CLOSER_BY: [f64; 2] = [0.88, 1.0 / 0.88];
+
+/// How many [`closer_looks`] there are of a camera.
+pub(super) const CLOSER_LOOKS: usize = 9;
 
 /// Less than this of an object in sight is taken for this much: of what it says of a pose nothing is known.
 const LEAST_IN_SIGHT: f64 = 0.1;
@@ -118,7 +124,7 @@ impl Query {
     pub(crate) fn most_rays(&self, options: &Options) -> usize {
         let starts = self.all_starts(options).len();
         let rays = |phase: &Phase| {
-            let tried = if phase.outlines { outlines().count() } else { 1 } * if phase.turns { 1 + TURNS } else { 1 };
+            let tried = if phase.outlines { outlines().count() } else { 1 } * if phase.closer_look { CLOSER_LOOKS } else { 1 };
             tried * starts.min(phase.keep) * self.rays(phase.stride).count()
         };
         options.phases.iter().map(rays).max().unwrap_or(0)
@@ -191,6 +197,13 @@ impl Seen<'_> {
     pub fn area(&self) -> f64 {
         self.coverage.iter().enumerate().map(|(pixel, cover)| f64::from(cover * self.weight(pixel))).sum()
     }
+}
+
+/// A camera as it is, [`turned`] by 15°, and nearer and farther away.
+pub(super) fn closer_looks(world_from_camera: &DMat4) -> impl Iterator<Item = DMat4> {
+    let as_it_is = *world_from_camera;
+    let moved = move |by: f64| DMat4 { w_axis: (by * as_it_is.w_axis.truncate()).extend(1.0), ..as_it_is };
+    iter::once(as_it_is).chain(turned(world_from_camera, CLOSER_DEG)).chain(CLOSER_BY.map(moved))
 }
 
 /// A camera turned about the object, to either side about each of its axes.
