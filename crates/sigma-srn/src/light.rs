@@ -6,11 +6,11 @@ use serde::Serialize;
 /// Parts of a pixel that count, in sum, below which a picture says nothing of its light.
 const FEWEST: f64 = 16.0;
 /// How much of a pixel the object covers whose colour is the object's.
-const COVERED: f32 = 0.9;
+pub(crate) const COVERED: f32 = 0.9;
 /// Where the model's view has a channel below this, it shows the object, not white background.
 const SHOWN: f32 = 0.8;
 /// Variance of a channel that is no contrast yet (colours span 2): a surface of one colour has nothing but noise.
-const NOISE: f64 = 4e-4;
+pub(crate) const NOISE: f64 = 4e-4;
 /// The least and the most contrast that is made up for.
 const CONTRASTS: [f64; 2] = [0.4, 2.5];
 /// From which correlation of picture and view on the contrast between them is believed, and from which altogether, where the picture does not show where the

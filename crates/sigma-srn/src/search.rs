@@ -3,7 +3,7 @@
 use glam::DMat4;
 use web_time::Instant;
 
-use crate::confidence::{Confidence, Doubt, hidden_doubt, unexplained, unexplained_doubt};
+use crate::confidence::{Confidence, Doubt, explains_colours, hidden_doubt, unexplained, unexplained_doubt};
 use crate::estimator::{Effort, Estimate, Options, Progress, Query, at_work, check, estimate};
 use crate::renderer::{View, render_views};
 use crate::unseen::estimate_unseen;
@@ -176,9 +176,12 @@ impl Search {
         let doubt = match self.accept {
             Some(_) if !estimate.loss.is_finite() => Some(Doubt::Loss),
             Some(most) => unexplained_doubt(unexplained, most),
-            None => {
-                doubt(&estimate, unexplained).or_else(|| hidden_doubt(estimate.weights.as_deref()?, &view, query.width as usize))
-            }
+            None => doubt(&estimate, unexplained).or_else(|| {
+                let weights = estimate.weights.as_deref()?;
+                let coverage = query.seen(estimate.outline.unwrap_or_default()).coverage;
+                let explains_colours = explains_colours(&estimate.target, &coverage, weights, &view);
+                hidden_doubt(weights, &view, query.width as usize, explains_colours, estimate.rival().map(|(_, higher)| higher))
+            }),
         };
         let confidence = Confidence::of(model, query.instance, &estimate);
         let world_from_camera = estimate.pose.to_matrix();

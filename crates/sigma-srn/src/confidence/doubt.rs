@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use crate::confidence::Calibration;
 use crate::estimator::{Estimate, Ranked};
+use crate::light::{COVERED, NOISE};
 use crate::model::{Metadata, Model};
 use crate::unseen::Unseen;
 
@@ -22,8 +23,8 @@ pub enum Doubt {
     Small,
     /// A pose elsewhere explains the picture nearly as well.
     Rival,
-    /// It explains the picture by much of the object, and by nearly all of its outline, lying where the picture does not count: there may be
-    /// anything, and of what is left in sight many poses are right.
+    /// It explains the picture by much of the object lying where the picture does not count, and of what is in sight neither its outline nor its colours
+    /// tell: many poses are right.
     Hidden,
 }
 
@@ -35,15 +36,15 @@ impl std::fmt::Display for Doubt {
             Doubt::Distance => "nearer or farther than the model knows",
             Doubt::Small => "too small in the picture",
             Doubt::Rival => "another pose does nearly as well",
-            Doubt::Hidden => "too much of the object lies behind the mask, its outline too",
+            Doubt::Hidden => "too much of the object lies behind the mask, and what is in sight does not tell",
         })
     }
 }
 
 /// What a picture may leave unexplained where there is no calibration.
 const UNEXPLAINED: f64 = 0.25;
-/// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on (`docs/accuracy.md`).
-const UNSEEN_RIVAL: f64 = 0.3;
+/// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on, or that is partly hidden (`docs/accuracy.md`).
+const RIVAL: f64 = 0.3;
 
 /// How far apart poses are that are not the same minimum: a turn about the object in degrees.
 const ELSEWHERE_DEG: f64 = 10.0;
@@ -108,7 +109,7 @@ impl Unseen {
     /// matters more than what is unexplained is whether the other known objects that it began with led to the same pose.
     pub fn doubt(&self, model: &Model, unexplained: f64) -> Option<Doubt> {
         let most = model.metadata.calibration.as_ref().map_or(UNEXPLAINED, |calibration| calibration.unexplained);
-        let has_rival = self.estimate.rival().is_some_and(|(_, higher)| higher < UNSEEN_RIVAL);
+        let has_rival = self.estimate.rival().is_some_and(|(_, higher)| higher < RIVAL);
         let picture = unexplained_doubt(unexplained, most).or(has_rival.then_some(Doubt::Rival));
         self.estimate.doubt_besides(&model.metadata, picture)
     }
@@ -135,13 +136,21 @@ const SHOWN: f64 = 0.3;
 /// all around which nothing counted, right poses hid 0.03 to 0.13 of the object, wrong ones 0.11 to 0.77 (`docs/accuracy.md`).
 const HIDDEN: f64 = 0.1;
 
-/// The doubt where more than a tenth of what a view shows `[height, width, 3]` lies where a picture does not count (`weights`, `[height, width]`), and hardly
-/// any of its outline where it does.
-pub(crate) fn hidden_doubt(weights: &[f32], view: &[f32], width: usize) -> Option<Doubt> {
+/// The doubt where more than a tenth of what a view `[height, width, 3]` shows lies where a picture does not count (`weights`, `[height, width]`): hardly any of
+/// its outline lies where it does, or the view does not explain the object's colours, or a rival does nearly as well.
+pub(crate) fn hidden_doubt(
+    weights: &[f32],
+    view: &[f32],
+    width: usize,
+    explains_colours: bool,
+    rival_higher: Option<f64>,
+) -> Option<Doubt> {
     let counts = |pixel: usize| f64::from(weights[pixel].clamp(0.0, 1.0));
-    let darkness: Vec<f64> =
-        view.chunks_exact(3).map(|pixel| pixel.iter().map(|colour| f64::from(1.0 - colour.clamp(-1.0, 1.0))).sum()).collect();
+    let darkness = darkness(view);
     let in_sight = (0..darkness.len()).map(|pixel| counts(pixel) * darkness[pixel]).sum::<f64>() / darkness.iter().sum::<f64>();
+    if in_sight.is_nan() || in_sight >= 1.0 - HIDDEN {
+        return None;
+    }
     let is_object = |pixel: usize| darkness[pixel] > SHOWN;
     let right = (1..darkness.len()).filter(|pixel| pixel % width != 0).map(|pixel| (pixel - 1, pixel));
     let below = (width..darkness.len()).map(|pixel| (pixel - width, pixel));
@@ -151,7 +160,33 @@ pub(crate) fn hidden_doubt(weights: &[f32], view: &[f32], width: usize) -> Optio
         .map(|(one, other)| counts(one).min(counts(other)))
         .collect();
     let has_outline = outline.iter().sum::<f64>() > HIDDEN * outline.len() as f64;
-    (in_sight < 1.0 - HIDDEN && !has_outline).then_some(Doubt::Hidden)
+    match rival_higher {
+        _ if !has_outline || !explains_colours => Some(Doubt::Hidden),
+        Some(higher) if higher < RIVAL => Some(Doubt::Rival),
+        _ => None,
+    }
+}
+
+/// How much darker than white each pixel is, all channels together.
+fn darkness(rgb: &[f32]) -> Vec<f64> {
+    rgb.chunks_exact(3).map(|pixel| pixel.iter().map(|colour| f64::from(1.0 - colour.clamp(-1.0, 1.0))).sum()).collect()
+}
+
+/// Whether a view `[pixels, 3]` is nearer to a picture `rgb` than one colour is, the mean of the object's own: where the object covers the picture
+/// (`coverage [pixels]`), the view shows it, and the picture counts (`weights [pixels]`). Where it does so nowhere, nothing speaks against it.
+pub(crate) fn explains_colours(rgb: &[f32], coverage: &[f32], weights: &[f32], view: &[f32]) -> bool {
+    let shown = darkness(view);
+    let both = |pixel: &usize| coverage[*pixel] >= COVERED && weights[*pixel] > 0.0 && shown[*pixel] > SHOWN;
+    let pixels: Vec<usize> = (0..coverage.len()).filter(both).collect();
+    let mean = |of: &dyn Fn(usize) -> f64| pixels.iter().map(|&pixel| of(pixel)).sum::<f64>() / pixels.len() as f64;
+    let (mut left, mut variance) = (0.0, 0.0);
+    for channel in 0..3 {
+        let colour = |pixel: usize| f64::from(rgb[3 * pixel + channel]);
+        let average = mean(&colour);
+        left += mean(&|pixel| (colour(pixel) - f64::from(view[3 * pixel + channel].clamp(-1.0, 1.0))).powi(2));
+        variance += mean(&|pixel| (colour(pixel) - average).powi(2)) + NOISE;
+    }
+    pixels.is_empty() || left <= variance
 }
 
 #[cfg(test)]
@@ -167,14 +202,14 @@ mod tests {
     use crate::model::ModelConfig;
 
     #[test]
-    fn an_object_of_which_much_is_hidden_is_trusted_by_its_outline() {
+    fn an_object_of_which_much_is_hidden_is_trusted_by_what_is_in_sight() {
         // A grey square of 8 × 8 pixels in the middle of 16 × 16.
         let inside =
             |pixel: usize, first: usize, last: usize| [pixel % 16, pixel / 16].map(|x| (first..last).contains(&x)) == [true; 2];
         let view: Vec<f32> = (0..3 * 256).map(|value| if inside(value / 3, 4, 12) { 0.0 } else { 1.0 }).collect();
         let doubt = |counts: &dyn Fn(usize) -> bool| {
             let weights: Vec<f32> = (0..256).map(|pixel| if counts(pixel) { 1.0 } else { 0.0 }).collect();
-            hidden_doubt(&weights, &view, 16)
+            hidden_doubt(&weights, &view, 16, true, None)
         };
         // All of it and nothing else; all but a rim of it; its left half, with what is around it, and without.
         assert_eq!(doubt(&|pixel| inside(pixel, 4, 12)), None);
@@ -182,8 +217,37 @@ mod tests {
         assert_eq!(doubt(&|pixel| pixel % 16 < 8), None);
         assert_eq!(doubt(&|pixel| inside(pixel, 4, 12) && pixel % 16 < 8), Some(Doubt::Hidden));
         // An object that fills the picture has no outline there.
-        assert_eq!(hidden_doubt(&[1.0, 1.0, 0.0, 1.0], &[0.0; 12], 2), Some(Doubt::Hidden));
-        assert_eq!(hidden_doubt(&[1.0; 4], &[0.0; 12], 2), None);
+        assert_eq!(hidden_doubt(&[1.0, 1.0, 0.0, 1.0], &[0.0; 12], 2, true, None), Some(Doubt::Hidden));
+        assert_eq!(hidden_doubt(&[1.0; 4], &[0.0; 12], 2, true, None), None);
+        // Its left half, with what is around it; then all of it: colours and rivals count only where something is hidden.
+        let half: Vec<f32> = (0..256).map(|pixel| if pixel % 16 < 8 { 1.0 } else { 0.0 }).collect();
+        for (explains, rival, doubt) in [
+            (true, Some(0.4), None),
+            (true, Some(0.2), Some(Doubt::Rival)),
+            (false, Some(0.4), Some(Doubt::Hidden)),
+            (false, None, Some(Doubt::Hidden)),
+        ] {
+            assert_eq!(hidden_doubt(&half, &view, 16, explains, rival), doubt, "{explains} {rival:?}");
+            assert_eq!(hidden_doubt(&[1.0; 256], &view, 16, explains, rival), None);
+        }
+    }
+
+    #[test]
+    fn a_view_explains_colours_that_it_is_nearer_to_than_one_colour_is() {
+        // Stripes; their background, and what does not count, say nothing.
+        let picture: Vec<f32> = (0..300).map(|value| if value / 3 % 2 == 0 { -0.6 } else { 0.2 }).collect();
+        let (mut coverage, mut weights) = ([1.0; 100], [1.0; 100]);
+        coverage[..20].fill(0.5);
+        weights[20..40].fill(0.0);
+        let explains = |view: &dyn Fn(f32) -> f32| {
+            let mut view: Vec<f32> = picture.iter().map(|&colour| view(colour)).collect();
+            view[..120].fill(-1.0);
+            explains_colours(&picture, &coverage, &weights, &view)
+        };
+        assert_eq!([0.0, 0.3, 0.5].map(|off| explains(&|colour| colour + off)), [true, true, false]);
+        assert!(!explains(&|colour| -0.4 - colour), "the stripes the other way round");
+        // It shows the object nowhere, or the picture does not.
+        assert!(explains(&|_| 1.0) && explains_colours(&picture, &[], &weights, &picture));
     }
 
     #[test]
