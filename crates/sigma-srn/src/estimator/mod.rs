@@ -276,7 +276,7 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
             if phase.keep < usize::MAX {
                 rest.extend(split_off_met(&mut own));
             }
-            let keep = if phase.outlines && !query.has_outline() { 0 } else { phase.keep };
+            let keep = query.keep(phase);
             let rival = if phase.outlines { None } else { take_rival(&mut own, keep, phase.stride) };
             let mut others = own.split_off(keep.min(own.len()));
             own.extend(rival);

@@ -24,6 +24,9 @@ const CLOSER_BY: [f64; 2] = [0.88, 1.0 / 0.88];
 /// How many [`closer_looks`] there are of a camera.
 pub(super) const CLOSER_LOOKS: usize = 9;
 
+/// How many times as many hypotheses of a partly hidden object go on while rays are few: what is in sight looks the same from more sides.
+const OF_HIDDEN: usize = 2;
+
 /// Less than this of an object in sight is taken for this much: of what it says of a pose nothing is known.
 const LEAST_IN_SIGHT: f64 = 0.1;
 
@@ -120,12 +123,21 @@ impl Query {
         self.starts.iter().copied().chain(around.into_iter().flatten()).collect()
     }
 
+    /// How many hypotheses enter a phase, see [`Phase::keep`].
+    pub(super) fn keep(&self, phase: &Phase) -> usize {
+        if phase.outlines {
+            return if self.has_outline() { phase.keep } else { 0 };
+        }
+        let is_wide = phase.stride > 1 && self.hidden_side().is_some();
+        phase.keep.saturating_mul(if is_wide { OF_HIDDEN } else { 1 })
+    }
+
     /// How many rays there are in the phase in which there are the most.
     pub(crate) fn most_rays(&self, options: &Options) -> usize {
         let starts = self.all_starts(options).len();
         let rays = |phase: &Phase| {
             let tried = if phase.outlines { outlines().count() } else { 1 } * if phase.closer_look { CLOSER_LOOKS } else { 1 };
-            tried * starts.min(phase.keep) * self.rays(phase.stride).count()
+            tried * starts.min(self.keep(phase)) * self.rays(phase.stride).count()
         };
         options.phases.iter().map(rays).max().unwrap_or(0)
     }
@@ -218,6 +230,21 @@ pub(super) fn turned(world_from_camera: &DMat4, degrees: f64) -> impl Iterator<I
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::estimator::Effort;
+
+    fn blank() -> Query {
+        Query {
+            instance: 0,
+            rgb: vec![1.0; 3 * 64 * 64],
+            weights: None,
+            coverage: None,
+            outline: Outline::AS_GIVEN,
+            width: 64,
+            height: 64,
+            intrinsics: Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.5 },
+            starts: vec![],
+        }
+    }
 
     #[test]
     fn added_starts_are_40_degrees_away_on_the_same_sphere() {
@@ -233,18 +260,20 @@ mod tests {
     }
 
     #[test]
+    fn of_an_object_that_is_partly_hidden_twice_as_many_go_on_while_rays_are_few() {
+        let disc = |pixel: i32| f32::from(((pixel % 64 - 32).pow(2) + (pixel / 64 - 32).pow(2)) < 400);
+        let coverage = Some((0..64 * 64).map(disc).collect());
+        let whole = Query { coverage, ..blank() };
+        let half = Query { weights: Some((0..64 * 64).map(|pixel| f32::from(pixel % 64 < 32)).collect()), ..whole.clone() };
+        let keep = |query: &Query| Options::of(Effort::Fast).phases.iter().map(|phase| query.keep(phase)).collect::<Vec<_>>();
+        assert_eq!(keep(&whole), [usize::MAX, 12, 6, 2, 1, 1, 1]);
+        assert_eq!(keep(&half), [usize::MAX, 24, 12, 4, 1, 1, 1]);
+        assert_eq!(keep(&blank()), [usize::MAX, 12, 6, 2, 0, 1, 1]);
+    }
+
+    #[test]
     fn of_an_object_as_much_is_in_sight_as_counts_of_the_disc_around_it() {
-        let query = Query {
-            instance: 0,
-            rgb: vec![1.0; 3 * 64 * 64],
-            weights: None,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            width: 64,
-            height: 64,
-            intrinsics: Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.5 },
-            starts: vec![],
-        };
+        let query = blank();
         let pose = Pose6::from_matrix(&crate::camera::look_at_origin(glam::DVec3::new(0.0, 1.3, 0.0)));
         let in_sight = |counts: &dyn Fn(f64, f64) -> bool| {
             let weight = |pixel: u32| f32::from(counts(f64::from(pixel % 64) - 31.5, f64::from(pixel / 64) - 31.5));
