@@ -47,14 +47,13 @@ impl Confidence {
 /// What the squared distance of six normal numbers from their mean, in units of their covariance, is below in 95 % of all cases.
 pub const WITHIN_95: f64 = 12.591_587;
 
-/// Where a mask says where the object ends: how much larger all variances are; by how many pixels the outline is still off when it has been
-/// found; and by which part of that, since what is cut away, or left on, is hardly the same all around (the latter two are standard deviations). By pictures
-/// whose masks were made wrong (`docs/accuracy.md`).
-const CUT_OUT: f64 = 2.0;
 /// How much larger variances are where a mask hides all around the object: by pictures of objects on a table (`docs/accuracy.md`).
-const WITHOUT_OUTLINE: f64 = 5.0;
-const OUTLINE: f64 = 0.25;
+const WITHOUT_OUTLINE: f64 = 8.0;
+/// Where a mask says where the object ends: by how many pixels one side of the outline may still be off when it has been found, by which part of what
+/// it was moved by, and by which part of a cut that was not made (standard deviations). By pictures whose masks were made wrong (`docs/accuracy.md`).
+const OUTLINE: f64 = 0.2;
 const OF_MOVED: f64 = 0.3;
+const OF_UNDECIDED: f64 = 0.5;
 
 /// The motion `(ω, υ)` about the object that takes one pose to another, in the axes of the first one's camera: the camera turned about the
 /// object's centre by `ω` (radians), then shifted by `υ` (object units).
@@ -95,15 +94,15 @@ impl Estimate {
         let of_picture = if self.is_without_outline { WITHOUT_OUTLINE } else { 1.0 / self.in_sight };
         let size = of_picture * calibration.sizes.get(instance).copied().unwrap_or(1.0);
         let mixed = mixed(&self.shape()?, calibration.curvature, &calibration.floor_of(self));
-        let Some(outline) = self.outline else { return Some(mixed.map(|row| row.map(|entry| size * entry))) };
-        // The views that a calibration is from have no masks. An object whose outline is taken to be farther out seems larger, and nearer.
-        let mut covariance = mixed.map(|row| row.map(|entry| CUT_OUT * size * entry));
-        let radius = 0.5 * self.extent * f64::from(self.width);
-        covariance[5][5] += (self.pose.distance() * OUTLINE.hypot(OF_MOVED * outline.moved()) / radius).powi(2);
-        // Were as much on one side no part of the object, its middle would be half as far to the other, it as much smaller, and turned as such a shift looks.
-        let part = 0.5 * outline.undecided / radius;
-        for (k, size) in [1.0, 1.0, 1.0, 0.5, 0.5, self.pose.distance()].into_iter().enumerate() {
-            covariance[k][k] += (size * part).powi(2);
+        let mut covariance = mixed.map(|row| row.map(|entry| size * entry));
+        if let Some(outline) = self.outline {
+            // The views that a calibration is from have no masks. With one side farther out an object's middle is half as far to that side, it is as much
+            // larger, so nearer, and turned as such a shift looks.
+            let off = OUTLINE.hypot(OF_MOVED * outline.moved()).hypot(OF_UNDECIDED * outline.undecided);
+            let part = off / (0.5 * self.extent * f64::from(self.width));
+            for (k, size) in [1.0, 1.0, 1.0, 0.5, 0.5, self.pose.distance()].into_iter().enumerate() {
+                covariance[k][k] += (size * part).powi(2);
+            }
         }
         Some(covariance)
     }
@@ -244,6 +243,8 @@ fn forward(lower: &Matrix6, mut x: [f64; 6]) -> [f64; 6] {
 
 #[cfg(test)]
 mod tests {
+    use glam::DVec2;
+
     use super::*;
     use crate::camera::look_at_origin;
     use crate::confidence::Seen;
@@ -289,39 +290,32 @@ mod tests {
         };
         assert_eq!([1.0, 0.5, 0.25].map(|in_sight| variances(false, in_sight)), [[1.0; 2], [2.0; 2], [4.0; 2]]);
         // What hides all around it has a factor of its own.
-        assert_eq!(variances(true, 0.5), [5.0; 2]);
+        assert_eq!([1.0, 0.5].map(|in_sight| variances(true, in_sight)), [[8.0; 2]; 2]);
     }
 
-    #[test]
-    fn a_mask_that_hides_the_outline_leaves_a_pose_much_less_sure() {
-        let variance = |is_without_outline| {
-            let estimate = Estimate { is_without_outline, ..estimate(look_at_origin(DVec3::new(0.0, 1.3, 0.0))) };
-            estimate.covariance("", &calibration(0.0, [1e-4; 6])).unwrap()[0][0]
-        };
-        assert_eq!([false, true].map(|hides| (1e4 * variance(hides)).round()), [1.0, 5.0]);
-    }
-
-    /// Where a mask says where the object ends all errors grow, and an outline that may be a quarter of a pixel off moves the camera by as large a part of
-    /// its distance as that is of half the object's diagonal.
+    /// An outline that may be a fifth of a pixel off on one side turns the object by as large a part as that is of half its diagonal, moves it by half that,
+    /// and the camera by that part of its distance.
     #[test]
     fn a_mask_leaves_a_pose_less_sure() {
-        let variances = |outline| {
+        let deviations = |outline| {
             let estimate = Estimate { outline, ..estimate(look_at_origin(DVec3::new(0.0, 1.3, 0.0))) };
             let covariance = estimate.covariance("", &calibration(0.0, [1e-4; 6])).unwrap();
-            [0, 4, 5].map(|k| (1e12 * covariance[k][k]).round())
+            // In pixels, of which 16 are half the diagonal.
+            [0, 2, 4, 5].map(|k| (1e9 * 16.0 * (covariance[k][k] - 1e-4).sqrt()).round() / 1e9)
         };
-        assert_eq!(variances(None), [1e8; 3]);
-        for (dilation, off) in [(0.0, 0.25), (2.0, 0.65), (-2.0, 0.65)] {
-            // In pixels, 0.65² = 0.25² + (0.3 · 2)².
-            let along: f64 = off * 1.3 / 16.0;
-            let outline = Outline { dilation, ..Outline::AS_GIVEN };
-            assert_eq!(variances(Some(outline)), [2e8, 2e8, (2e8 + 1e12 * along * along).round()], "{dilation}");
+        assert_eq!(deviations(None), [0.0; 4]);
+        let moved = |dilation, undecided| Outline { dilation, undecided, ..Outline::AS_GIVEN };
+        // 0.2² = 0.04, (0.3 · 2)² = 0.36, (0.5 · 2)² = 1.
+        for (outline, off) in [
+            (Outline::AS_GIVEN, 0.2),
+            (moved(2.0, 0.0), 0.4f64.sqrt()),
+            (moved(-2.0, 0.0), 0.4f64.sqrt()),
+            (moved(0.0, 2.0), 1.04f64.sqrt()),
+            (Outline { cut: DVec2::new(0.0, 2.0), ..moved(2.0, 2.0) }, 1.76f64.sqrt()),
+        ] {
+            let expected = [off, off, 0.5 * off, 1.3 * off].map(|pixels| (1e9 * pixels).round() / 1e9);
+            assert_eq!(deviations(Some(outline)), expected, "{outline:?}");
         }
-        // A sixteenth, by which half of what may have to be cut away changes what is seen.
-        let [turn, aside, along] = variances(Some(Outline { undecided: 2.0, ..Outline::AS_GIVEN }));
-        let part: f64 = 1e12 / 256.0;
-        assert_eq!([turn, aside], [2e8 + part, 2e8 + 0.25 * part]);
-        assert!((along - variances(Some(Outline::AS_GIVEN))[2] - 1.69 * part).abs() < 2.0, "{along}");
     }
 
     #[test]
