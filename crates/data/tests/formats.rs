@@ -509,6 +509,43 @@ fn no_picture_is_written_over_before_it_is_read() {
     }
 }
 
+/// What an earlier export left there is read by none: a model of the other kind, masks, pictures with another ending.
+#[test]
+fn a_later_export_is_the_one_that_is_read() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut earlier = made(dir.path(), "thing", 3, |_| PINHOLE);
+    let mask = dir.path().join("mask.png");
+    image::GrayImage::new(16, 12).save(&mask).unwrap();
+    earlier.frames.iter_mut().for_each(|frame| frame.mask = Some(mask.clone()));
+    let mut later = earlier.clone();
+    for frame in &mut later.frames {
+        frame.mask = None;
+        frame.camera.world_from_camera.w_axis.x += 0.1;
+        let image = frame.image.with_extension("jpg");
+        image::open(&frame.image).unwrap().save(&image).unwrap();
+        frame.image = image;
+    }
+    let replace = WriteOptions { replace: true, ..WriteOptions::default() };
+    let pairs = [(Format::Colmap, Format::ColmapText), (Format::ColmapText, Format::Colmap), (Format::Bop, Format::Bop)];
+    for (k, (first, second)) in pairs.into_iter().enumerate() {
+        let out = dir.path().join(format!("{k}"));
+        let folder = written(&earlier, first, &out);
+        assert!(read(&folder, first).frames.iter().all(|frame| frame.mask.is_some()), "{first:?}");
+        assert_eq!(formats::write(&later, second, &out, &replace).unwrap().dir, folder);
+        let found = read(&folder, second);
+        assert!(differences(&Capture { name: found.name.clone(), ..later.clone() }, &found)[0] < 1e-9, "{second:?}");
+        for (frame, written) in found.frames.iter().zip(&later.frames) {
+            assert_eq!(frame.mask, None, "{second:?}");
+            assert_eq!(
+                fs::read(&frame.image).unwrap(),
+                fs::read(&written.image).unwrap(),
+                "{second:?}: {}",
+                frame.image.display()
+            );
+        }
+    }
+}
+
 #[test]
 fn scenes_and_objects_have_numbers_of_their_own() {
     let captures = [

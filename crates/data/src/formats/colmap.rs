@@ -357,8 +357,16 @@ pub(super) fn write(capture: &Capture, dir: PathBuf, binary: bool, options: &Wri
         });
     }
     let write = |name: &str, content: Vec<u8>| {
-        let path = model.join(name).with_extension(if binary { "bin" } else { "txt" });
-        std::fs::write(&path, content).at(&path)
+        for (ending, is_binary) in ENDINGS {
+            let path = model.join(name).with_extension(ending);
+            // A model of the other kind, by an earlier export, might be read before this one.
+            match is_binary == binary {
+                true => std::fs::write(&path, &content).at(&path)?,
+                false if path.exists() => std::fs::remove_file(&path).at(&path)?,
+                false => {}
+            }
+        }
+        Ok(())
     };
     if binary {
         let mut bytes = (cameras.len() as u64).to_le_bytes().to_vec();

@@ -12,7 +12,7 @@ use crate::camera::{Axes, Camera};
 use crate::capture::{Capture, Frame, UpAxis};
 use crate::error::{At, Error, Result};
 use crate::picture::Picture;
-use crate::pixels::decode;
+use crate::pixels::{decode, with_ending};
 use crate::srn::{picture_size, rigid, write_png};
 use glam::DMat4;
 use std::path::{Path, PathBuf};
@@ -326,10 +326,19 @@ fn make_dir(dir: &Path, replace: bool) -> Result<()> {
     std::fs::create_dir_all(dir).at(dir)
 }
 
+/// Removes pictures of this name, with whatever ending, that an earlier export has left: one of those may be read before what is written now.
+fn remove_earlier(path: &Path) -> Result<()> {
+    while let Some(earlier) = with_ending(path) {
+        std::fs::remove_file(&earlier).at(&earlier)?;
+    }
+    Ok(())
+}
+
 /// Copies a view's picture to `folder/name` with its own ending; undistorted, as PNG, where `pinhole` asks for it. Gives the
 /// file's name and the camera that belongs to it.
 fn copy_picture(frame: &Frame, folder: &Path, name: &str, pinhole: bool) -> Result<(String, Camera)> {
     std::fs::create_dir_all(folder).at(folder)?;
+    remove_earlier(&folder.join(name))?;
     if pinhole && !frame.camera.is_pinhole() {
         let camera = Camera { distortion: [0.0; 5], ..frame.camera };
         let file = format!("{name}.png");
@@ -342,8 +351,9 @@ fn copy_picture(frame: &Frame, folder: &Path, name: &str, pinhole: bool) -> Resu
     Ok((file, frame.camera))
 }
 
-/// Copies a view's mask, likewise.
+/// Copies a view's mask, likewise; where it has none, there is none afterwards.
 fn copy_mask(frame: &Frame, path: &Path, pinhole: bool) -> Result<()> {
+    remove_earlier(&path.with_extension(""))?;
     let Some(mask) = &frame.mask else { return Ok(()) };
     let folder = path.parent().unwrap_or(path);
     std::fs::create_dir_all(folder).at(folder)?;
