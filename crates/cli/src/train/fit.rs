@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -53,6 +53,11 @@ pub struct FitArgs {
     json: bool,
 }
 
+/// The error of a new run where there is something already.
+fn is_there(run: &Path) -> String {
+    format!("{}: not empty, nothing was overwritten; --resume goes on with a run", run.display())
+}
+
 /// Trains; false if it was stopped before the end.
 pub fn fit(args: &FitArgs) -> Result<bool> {
     let is_resumed = args.resume.is_some();
@@ -69,7 +74,7 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         settings
     } else {
         if fs::read_dir(run).is_ok_and(|mut files| files.next().is_some()) {
-            return Err(format!("{}: not empty, nothing was overwritten; --resume goes on with a run", run.display()).into());
+            return Err(is_there(run).into());
         }
         Settings::new(&args.for_good, &args.changeable)?
     };
@@ -122,6 +127,10 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     fs::create_dir_all(run).map_err(|error| format!("{}: {error}", run.display()))?;
     if !is_resumed {
         held = Some(lock(run)?);
+        // Another may have begun, and ended, since this one looked.
+        if Settings::is_in(run) {
+            return Err(is_there(run).into());
+        }
     }
     // Now that it is known whether a GPU is believed.
     (settings.executor, settings.memory) = (engine.to_string(), engine.budget());
@@ -329,7 +338,10 @@ struct Metrics {
 impl Metrics {
     /// Opens or makes the file; lines behind `step`, and one cut short by a crash, are dropped.
     fn open(path: PathBuf, step: u64) -> Result<Self> {
-        let text = fs::read_to_string(&path).unwrap_or_default();
+        let text = match fs::read(&path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
+            bytes => String::from_utf8_lossy(&bytes.map_err(|error| format!("{}: {error}", path.display()))?).into_owned(),
+        };
         let records = text.lines().filter_map(|line| serde_json::from_str(line).ok());
         let records: Vec<Record> = records.filter(|record: &Record| record.step <= step).collect();
         let lines = records.iter().map(|record| Ok(serde_json::to_string(record)? + "\n")).collect::<Result<String>>()?;

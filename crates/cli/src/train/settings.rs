@@ -9,6 +9,9 @@ use sigma_srn::{ModelConfig, write_atomically};
 
 use crate::common::Result;
 
+/// What a run was begun with, in its folder.
+const CONFIG: &str = "config.json";
+
 /// Everything that decides the numbers of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -254,16 +257,21 @@ impl Settings {
         take!(self, flags: data, validation, steps, lr, warm_up, decay, decay_from);
     }
 
+    /// Whether there is a run in this folder.
+    pub fn is_in(run: &Path) -> bool {
+        run.join(CONFIG).exists()
+    }
+
     /// Reads the `config.json` of a run.
     pub fn read(run: &Path) -> Result<Self> {
-        let path = run.join("config.json");
+        let path = run.join(CONFIG);
         let text = std::fs::read_to_string(&path).map_err(|error| format!("{}: {error}; no run to resume", path.display()))?;
         serde_json::from_str(&text).map_err(|error| format!("{}: {error}", path.display()).into())
     }
 
     /// Writes the `config.json` of a run.
     pub fn write(&self, run: &Path) -> Result<()> {
-        Ok(write_atomically(&run.join("config.json"), (serde_json::to_string_pretty(self)? + "\n").as_bytes())?)
+        Ok(write_atomically(&run.join(CONFIG), (serde_json::to_string_pretty(self)? + "\n").as_bytes())?)
     }
 
     /// Learning rate of a step, counted from 1.
