@@ -209,6 +209,29 @@ fn backward_input() -> Vec<Case> {
     sizes().chain(wide).map(backward_input_case).collect()
 }
 
+/// A plan with many tiles needs no more memory for its long sums than one with a single tile.
+#[test]
+fn long_sums_share_a_buffer() {
+    let mut s = Sketch::new("two tiles");
+    let size = Size {
+        rows: Rows { groups: 1, rows_per_group: 3, first_group: 0 },
+        in_features: 3,
+        out_features: 2050,
+        sets: 1,
+        accumulate: false,
+    };
+    let layer = layer(&mut s, size);
+    let slots = s.indices("slots", 1, 1);
+    for _ in 0..2 {
+        let d_y = s.random("d_y", 3 * 2050);
+        let d_x = s.output("d_x", 3 * 3, false);
+        s.step(|b| linear::backward_input(b, size.rows, layer, d_y, slots, d_x, false));
+    }
+    let buffers = s.finish().plan.buffers.len();
+    // Weights, slots, twice d_y and d_x.
+    assert_eq!(buffers, 2 + 2 * 2 + 1);
+}
+
 fn backward_input_case(size: Size) -> Case {
     let mut s = Sketch::new(format!("{size:?}"));
     let Size { rows, accumulate, .. } = size;

@@ -49,6 +49,14 @@ impl Builder {
         self.buffer(name.into(), len, Element::F32, Role::Scratch)
     }
 
+    /// A buffer of `f32` for what one step hands to the next: all that ask for this name and length share it, for nobody needs it any longer than that.
+    pub fn passing(&mut self, name: &str, len: usize) -> Result<BufferId, PlanError> {
+        match self.plan.buffers.iter().position(|buffer| buffer.name == name && buffer.len == len) {
+            Some(index) => Ok(BufferId(index as u32)),
+            None => self.scratch(name, len),
+        }
+    }
+
     /// Adds a buffer of `u32` that a step fills.
     pub fn scratch_u32(&mut self, name: impl Into<String>, len: usize) -> Result<BufferId, PlanError> {
         self.buffer(name.into(), len, Element::U32, Role::Scratch)

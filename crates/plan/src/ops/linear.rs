@@ -124,7 +124,7 @@ pub fn backward_input(
     let (chunk_outs, chunks) = (layer.out_features.min(most), layer.out_features.div_ceil(most).max(1));
     let values = size([rows.count(), layer.in_features]);
     let in_parts = chunks > 1;
-    let to = if in_parts { b.scratch("parts of long sums", chunks as usize * values)? } else { d_x };
+    let to = if in_parts { b.passing("parts of long sums", chunks as usize * values)? } else { d_x };
     let args = [
         read(d_y, size([rows.count(), layer.out_features])),
         read(layer.weights, layer.weights_len()),
