@@ -70,6 +70,16 @@ fn engines() -> [Engine; 2] {
 }
 
 #[test]
+fn more_rays_than_can_be_counted_are_refused() {
+    let engine = Engine::cpu();
+    let model = trainer(&engine).model().unwrap().clone();
+    let error = Renderer::new(&engine, &model, 1, 1 << 16, 1 << 16).err().unwrap();
+    assert!(error.to_string().contains("rays"), "{error}");
+    let error = Trainer::new(&engine, model, Train::Codes, 1 << 16, 1 << 16).err().unwrap();
+    assert!(error.to_string().contains("rays"), "{error}");
+}
+
+#[test]
 fn training_lowers_the_loss() {
     for engine in engines() {
         let [first, last] = train(&mut trainer(&engine), 100);
@@ -104,6 +114,7 @@ fn a_ray_shows_the_same_from_everywhere_on_it() {
     });
     let spread = |model: &Model, engine: &Engine| {
         let rgb = Renderer::new(engine, model, 4, 1, 1).unwrap().render(&[0; 4], &cameras, 0).unwrap().rgb;
+        assert!(rgb.iter().all(|value| value.is_finite()), "{rgb:?}");
         (3..12).map(|k| (rgb[k] - rgb[k % 3]).abs()).fold(0.0, f32::max)
     };
     for engine in engines() {

@@ -93,11 +93,11 @@ impl Renderer {
     }
 
     fn unproven(engine: &Engine, model: &Model, views: u32, width: u32, height: u32) -> Result<Self, Error> {
-        let rays = width * height;
+        let rays = Engine::rows([views, width, height])?;
         let size = [width, height];
         let on_host = OnHost::of(engine, model, 1);
-        let (plan, mut handles) = engine
-            .fit(views * rays, model.layout.features(), |b, tile_rows| build(b, model, views, size, tile_rows, &on_host))?;
+        let (plan, mut handles) =
+            engine.fit(rays, model.layout.features(), |b, tile_rows| build(b, model, views, size, tile_rows, &on_host))?;
         let mut runner = engine.prepare(plan)?;
         handles.instances.upload(&mut *runner, &handles.network, model)?;
         let slots: Vec<u32> = (0..views).collect();

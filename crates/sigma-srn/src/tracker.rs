@@ -59,7 +59,7 @@ impl Tracker {
             dilation: rim.dilation.clamp(-WIDEST_RIM, WIDEST_RIM),
             cut: rim.cut.clamp_length_max(WIDEST_CUT),
             missing: rim.missing.clamp_length_max(MISSING),
-            ..rim
+            undecided: rim.undecided.min(WIDEST_CUT),
         };
         let frame = Query { instance: self.number, outline, ..frame };
         let near = match self.before[..] {

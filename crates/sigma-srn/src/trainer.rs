@@ -149,7 +149,7 @@ impl Trainer {
         let features = model.layout.features();
         // Value, gradient and two moments.
         let on_host = OnHost::of(engine, &model, if train == Train::Everything { 4 } else { 1 });
-        let (plan, handles) = engine.fit(images * rays, features, |b, tile_rows| {
+        let (plan, handles) = engine.fit(Engine::rows([images, rays])?, features, |b, tile_rows| {
             let cut = tiles(images, rays, tile_rows);
             build(b, &model, train, batch, &cut, engine.part_rows(tile_rows, features), &on_host)
         })?;

@@ -79,13 +79,14 @@ pub fn estimate_unseen(
 fn fit_codes(engine: &Engine, model: Model, query: &Query, poses: &[DMat4], seed: u64) -> Result<Model, Error> {
     let pixels: Vec<(u32, u32)> = pixel_grid(query.width, query.height, 2).collect();
     let mut trainer = Trainer::new(engine, model, Train::Codes, poses.len() as u32, pixels.len() as u32)?;
-    let of_pixel = |&(u, v): &(u32, u32)| &query.rgb[3 * (v * query.width + u) as usize..][..3];
+    let seen = query.seen(query.outline);
+    let of_pixel = |&(u, v): &(u32, u32)| &seen.rgb[3 * (v * query.width + u) as usize..][..3];
     let colours: Vec<f32> = pixels.iter().flat_map(of_pixel).copied().collect();
     let mut random = stream(seed, 0);
     let mut rays = Rays::default();
     poses.iter().for_each(|pose| rays.push(pose, &query.intrinsics, pixels.iter().copied(), &mut random));
     let (instances, target_rgb) = ((0..poses.len() as u32).collect(), colours.repeat(poses.len()));
-    let weights = query.seen(query.outline).ray_weights(query.pixels(2)).repeat(poses.len());
+    let weights = seen.ray_weights(query.pixels(2)).repeat(poses.len());
     let batch = TrainingBatch { instances, rays, target_rgb, weights: Some(weights) };
     for _ in 0..CODE_STEPS {
         trainer.step(&batch, LEARNING_RATE)?;

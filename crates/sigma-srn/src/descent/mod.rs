@@ -129,7 +129,7 @@ impl Descent {
                 return Err(Error::Setting { field: "method", what });
             }
         }
-        let rows = hypotheses * width * height;
+        let rows = Engine::rows([hypotheses, width, height])?;
         let on_host = OnHost::of(engine, model, 1);
         let (plan, mut handles) = engine
             .fit(rows, model.layout.features(), |b, tile_rows| build(b, model, shape, method, is_moving, tile_rows, &on_host))?;

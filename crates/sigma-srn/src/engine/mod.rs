@@ -145,6 +145,12 @@ impl Engine {
         Builder::new(self.max_binding_bytes())
     }
 
+    /// So many rows: the product.
+    pub(crate) fn rows<const N: usize>(factors: [u32; N]) -> Result<u32, Error> {
+        let product = factors.into_iter().try_fold(1u32, u32::checked_mul);
+        product.ok_or_else(|| Error::Setting { field: "rays", what: format!("{factors:?} are more than {} at once", u32::MAX) })
+    }
+
     /// Builds a plan with the largest tiles that fit the budget and the device's limits, for a network of `features`
     /// wide layers; `build` gets the rows of a tile. Where nothing fits, the error says what the smallest tiles need that are still few enough.
     pub(crate) fn fit<T>(
