@@ -259,8 +259,8 @@ fn keep(folder: &Path, key: &str, word: &str) -> io::Result<()> {
     let lines: String = known.iter().map(|(key, label)| format!("{key} {label}\n")).collect();
     let nanoseconds = SystemTime::UNIX_EPOCH.elapsed().map_or(0, |time| time.as_nanos());
     let new = folder.join(format!("{FILE}.{}.{nanoseconds}", std::process::id()));
-    fs::write(&new, lines)?;
-    fs::rename(&new, folder.join(FILE)).inspect_err(|_| drop(fs::remove_file(&new)))
+    let written = fs::write(&new, lines).and_then(|()| fs::rename(&new, folder.join(FILE)));
+    written.inspect_err(|_| drop(fs::remove_file(&new)))
 }
 
 #[cfg(test)]

@@ -30,7 +30,8 @@ function say(text, kind = "") {
 async function alone(work) {
   if (busy || !session) return;
   busy = true;
-  at("search").disabled = true;
+  // Another executor is another session: not in the middle of this one's work.
+  at("search").disabled = at("executor").disabled = true;
   try {
     await work();
   } catch (error) {
@@ -38,6 +39,7 @@ async function alone(work) {
     throw error;
   } finally {
     busy = false;
+    at("executor").disabled = false;
     at("search").disabled = !picture;
   }
   if (stale) look();
