@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -54,6 +55,9 @@ fn source_format(text: &str) -> std::result::Result<SourceFormat, String> {
 fn target_format(text: &str) -> std::result::Result<Format, String> {
     named(text, &Format::ALL, Format::name)
 }
+
+/// So many of an object's diagonals a camera can be away from its centre in earnest.
+const SANE_DISTANCES: RangeInclusive<f64> = 1e-3..=1e4;
 
 fn above_zero(text: &str) -> std::result::Result<f64, String> {
     text.parse().ok().filter(|x: &f64| *x > 0.0 && x.is_finite()).ok_or("expected a number above 0".into())
@@ -210,17 +214,26 @@ impl Import {
             let total = placed * before.as_ref().map_or(DMat4::IDENTITY, FrameRecord::matrix);
             let record = FrameRecord { world_from_source: total.transpose().to_cols_array_2d(), ..before.unwrap_or(made) };
             capture.transform(&placed);
+            let far = |frame: &Frame| frame.camera.world_from_camera.w_axis.truncate().length();
+            if let Some(frame) = capture.frames.iter().find(|frame| !keep && !SANE_DISTANCES.contains(&far(frame))) {
+                let (name, distance) = (frame.image.display(), far(frame));
+                let found_by = &record.found_by;
+                return Err(format!(
+                    "{name}: its camera is {distance:.1e} diagonals from the object's centre ({found_by}); nothing was changed"
+                )
+                .into());
+            }
             for folder in folders {
                 let part = match (self.hold_out, *folder) {
                     (Some(n), folder) => every(capture, n as usize, folder == "test"),
                     (None, _) => std::mem::take(capture),
                 };
                 let written = formats::write(&part, Format::Srn, &self.out.join(folder), &options)?;
-                record.write(&written.dir)?;
                 bar.suspend(|| report(&part, &written, &format!("frame: {}", record.found_by)))?;
                 if written.views == 0 {
-                    return Err(format!("{}: no view could be written", written.dir.display()).into());
+                    return Err(format!("{}: no view could be written, nothing was changed", written.dir.display()).into());
                 }
+                record.write(&written.dir)?;
             }
             bar.inc(1);
         }
@@ -444,7 +457,7 @@ pub struct Inspect {
     /// Print the findings as JSON.
     #[arg(long)]
     json: bool,
-    /// Write a contact sheet with the axes and a drawing of the cameras to this picture, a .png or .jpg.
+    /// Write a contact sheet with the axes and a drawing of the cameras to this picture, a .png, .jpg or .bmp.
     #[arg(long)]
     out: Option<PathBuf>,
     /// Overwrite the picture.
@@ -458,6 +471,13 @@ impl Inspect {
         let Some(path) = &self.path else { return meshes::inspect(&self.meshes, self.json) };
         self.out.iter().try_for_each(|out| refuse_to_write(out, self.force))?;
         let (format, mut captures) = self.source.read(path)?;
+        if let Some(out) = self.out.as_ref().filter(|out| out.exists()) {
+            let is_out = |path: &PathBuf| std::fs::canonicalize(path).ok() == std::fs::canonicalize(out).ok();
+            let frames = captures.iter().flat_map(|capture| &capture.frames);
+            if frames.flat_map(|frame| frame.mask.iter().chain([&frame.image])).any(is_out) {
+                return Err(format!("{}: one of the pictures that are read", out.display()).into());
+            }
+        }
         let origin = if format == Format::Srn { Origin::Given } else { Origin::Found };
         if origin == Origin::Found {
             inspect::place_all(&mut captures, format.up())?;

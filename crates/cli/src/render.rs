@@ -29,7 +29,7 @@ pub struct Render {
     #[arg(long)]
     out: PathBuf,
     /// Width and height of the pictures in pixels.
-    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u32).range(8..))]
     side: u32,
     /// Distance of the cameras to the object's centre; the diagonal of its bounding box is 1. Default: 1.3; of a set, the paper's.
     #[arg(long, value_parser = |x: &str| between(x, 0.5, f64::MAX))]
@@ -247,6 +247,11 @@ impl Render {
             (_, Some(fov)) => 0.5 * side as f64 / (0.5 * fov.to_radians()).tan(),
             _ => camera::fitting_focal_px(side, radius),
         };
+        let sane = [0.01, 1000.0].map(|times| times * side as f64);
+        if !(sane[0]..=sane[1]).contains(&focal) {
+            let [low, high] = sane;
+            return Err(format!("a focal length of {focal:e} px: expected {low} to {high} for pictures {side} px wide").into());
+        }
         // The SRN convention puts the principal point at side / 2 while integer coordinates are pixel centres.
         let half = side as f64 / 2.0;
         let intrinsics = Intrinsics { focal: [focal; 2], centre: [half, half], size: [side, side] };
@@ -279,6 +284,7 @@ impl Studio<'_> {
                 writer.add(&format!("{i:06}"), &self.picture(&model, pose)?, pose)?;
                 self.bar.inc(1);
             }
+            writer.finish()?;
         }
         self.picture(&model, &camera::look_at_origin(self.radius * DVec3::new(0.5, -0.7, 0.5).normalize()))
     }

@@ -333,6 +333,26 @@ fn what_cannot_be_done_leaves_everything_as_it_was() {
         assert!(files() == before, "{args:?}");
         assert!(!dir.path().join("test").exists(), "{args:?}");
     }
+    // What may be replaced is, once there is something to put in its place.
+    let (black, picture, mesh) =
+        (dir.path().join("black"), path("train/a/rgb/0156.png"), format!("a={ASSETS}/meshes/forklift/forklift.obj"));
+    fs::create_dir(&black).unwrap();
+    for photo in fs::read_dir(format!("{BOX}/images")).unwrap().map(|photo| photo.unwrap().path()) {
+        let (width, height) = image::image_dimensions(&photo).unwrap();
+        image::GrayImage::new(width, height).save(black.join(photo.file_stem().unwrap()).with_extension("png")).unwrap();
+    }
+    let black = black.to_str().unwrap();
+    for (args, words) in [
+        (&["import", BOX, "--out", &set, "--name", "a", "--side", "16", "--mask", black][..], "no view"),
+        (&["import", BOX, "--out", &set, "--name", "a", "--centre", "0,0,0", "--diagonal", "1e300"], "diagonals"),
+        (&["render", &mesh, "--out", &set, "--views", "2", "--side", "30000"], "30000"),
+        (&["render", &mesh, "--out", &set, "--views", "2", "--focal", "1e-9"], "focal length"),
+        (&["inspect", &set, "--out", &picture], "0156.png"),
+    ] {
+        let refused = sigma_data(&[args, &["--force"]].concat());
+        assert!(refused.status.code() == Some(2) && stderr(&refused).contains(words), "{args:?}: {}", stderr(&refused));
+        assert!(files() == before && !dir.path().join("train/a/.new").exists(), "{args:?}");
+    }
     let few = sigma_data(&["import", BOX, "--out", &path("few"), "--hold-out", "5"]);
     assert!(few.status.code() == Some(2) && stderr(&few).contains("box: --hold-out 5 takes 5"), "{}", stderr(&few));
     assert!(!dir.path().join("few").exists());

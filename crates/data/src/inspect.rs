@@ -378,6 +378,7 @@ mod tests {
             for (i, pose) in uniform_sphere(4, 1.3, 1).iter().enumerate() {
                 writer.add(&format!("{i}"), &ball(pose), pose).unwrap();
             }
+            writer.finish().unwrap();
         }
         dir
     }

@@ -288,6 +288,9 @@ impl Intrinsics {
         let is_matrix = |k: &Vec<f64>| [k[1], k[3], k[6], k[7]] == [0.0; 4] && k[8] == 1.0;
         let (intrinsics, inverted) = if let Some(k) = whole().filter(is_matrix) {
             (Self { focal: [k[0], k[4]], centre: [k[2], k[5]], size: picture }, false)
+        } else if lines.len() == 3 && whole().is_some() {
+            let found = text.split_whitespace().collect::<Vec<_>>().join(" ");
+            return Err(Error::field(path, "3×3 matrix", "fx 0 cx, 0 fy cy, 0 0 1 row by row, without skew", found));
         } else {
             let camera = line(0, "f cx cy", 3)?;
             let size = line(3, "height width", 2)?;
@@ -359,15 +362,19 @@ impl std::fmt::Display for Intrinsics {
     }
 }
 
-/// Writes one instance folder, view by view.
+/// Where in an instance's folder what is new waits until all of it is there.
+const NEW: &str = ".new";
+
+/// Writes one instance folder, view by view. Nothing of it is there, and what was there before stays, until [`InstanceWriter::finish`].
 #[derive(Debug)]
 pub struct InstanceWriter {
     dir: PathBuf,
+    new: PathBuf,
 }
 
 impl InstanceWriter {
-    /// Makes `dir` with its `intrinsics.txt`. If `dir` exists it is refused, or, with `replace`, its pictures, poses,
-    /// intrinsics and `frame.json` are removed; files of other kinds stay.
+    /// For a `dir` with an `intrinsics.txt`. If `dir` exists it is refused, or, with `replace`, its pictures, poses,
+    /// intrinsics and `frame.json` are removed in the end; files of other kinds stay.
     pub fn create(dir: impl Into<PathBuf>, intrinsics: &Intrinsics, replace: bool) -> Result<Self> {
         let writer = Self::bare(dir, replace)?;
         writer.intrinsics(intrinsics)?;
@@ -377,35 +384,58 @@ impl InstanceWriter {
     /// The same without intrinsics.
     pub(crate) fn bare(dir: impl Into<PathBuf>, replace: bool) -> Result<Self> {
         let dir = dir.into();
-        if dir.exists() {
-            if !replace {
-                return Err(Error::Exists { path: dir });
-            }
-            let views = InstanceFiles::open(dir.clone()).map(|files| files.views).unwrap_or_default();
-            let of_views = std::fs::read_dir(dir.join("intrinsics")).into_iter().flatten().flatten().map(|entry| entry.path());
-            let is_own = |path: &PathBuf| path.extension().is_some_and(|ending| ending == "txt");
-            // The frame that the views before were in, too.
-            let whole = [dir.join("intrinsics.txt"), dir.join(FrameRecord::FILE)].into_iter().filter(|path| path.exists());
-            let others: Vec<_> = of_views.filter(is_own).chain(whole).collect();
-            for path in views.into_iter().flat_map(|view| [view.rgb, view.pose]).flatten().chain(others) {
-                std::fs::remove_file(&path).at(&path)?;
-            }
+        if dir.exists() && !replace {
+            return Err(Error::Exists { path: dir });
         }
-        for folder in ["rgb", "pose"].map(|name| dir.join(name)) {
+        let new = dir.join(NEW);
+        if new.exists() {
+            // Of one that was killed.
+            std::fs::remove_dir_all(&new).at(&new)?;
+        }
+        let writer = Self { dir, new };
+        for folder in ["rgb", "pose"].map(|name| writer.new.join(name)) {
             std::fs::create_dir_all(&folder).at(&folder)?;
         }
-        Ok(Self { dir })
+        Ok(writer)
+    }
+
+    /// Where pictures of views are to be written, `NAME.png` or with another ending.
+    pub(crate) fn pictures(&self) -> PathBuf {
+        self.new.join("rgb")
+    }
+
+    /// Puts what was written in the place of what was there.
+    pub fn finish(self) -> Result<()> {
+        let Self { dir, new } = &self;
+        let views = InstanceFiles::open(dir.clone()).map(|files| files.views).unwrap_or_default();
+        let of_views = std::fs::read_dir(dir.join("intrinsics")).into_iter().flatten().flatten().map(|entry| entry.path());
+        let is_own = |path: &PathBuf| path.extension().is_some_and(|ending| ending == "txt");
+        // The frame that the views before were in, too.
+        let whole = [dir.join("intrinsics.txt"), dir.join(FrameRecord::FILE)].into_iter().filter(|path| path.exists());
+        let others: Vec<_> = of_views.filter(is_own).chain(whole).collect();
+        for path in views.into_iter().flat_map(|view| [view.rgb, view.pose]).flatten().chain(others) {
+            std::fs::remove_file(&path).at(&path)?;
+        }
+        for folder in ["", "intrinsics", "pose", "rgb"] {
+            let (from, to) = (new.join(folder), dir.join(folder));
+            for entry in std::fs::read_dir(&from).into_iter().flatten().flatten().filter(|entry| entry.path().is_file()) {
+                std::fs::create_dir_all(&to).at(&to)?;
+                let to = to.join(entry.file_name());
+                std::fs::rename(entry.path(), &to).at(&to)?;
+            }
+        }
+        Ok(())
     }
 
     /// Writes the intrinsics of all views.
     pub(crate) fn intrinsics(&self, intrinsics: &Intrinsics) -> Result<()> {
-        let path = self.dir.join("intrinsics.txt");
+        let path = self.new.join("intrinsics.txt");
         std::fs::write(&path, intrinsics.to_string()).at(&path)
     }
 
     /// Writes the intrinsics of one view.
     pub(crate) fn view_intrinsics(&self, view: &str, intrinsics: &Intrinsics) -> Result<()> {
-        let folder = self.dir.join("intrinsics");
+        let folder = self.new.join("intrinsics");
         std::fs::create_dir_all(&folder).at(&folder)?;
         let path = folder.join(format!("{view}.txt"));
         std::fs::write(&path, intrinsics.to_string()).at(&path)
@@ -413,15 +443,23 @@ impl InstanceWriter {
 
     /// Writes `rgb/<name>.png` and `pose/<name>.txt`.
     pub fn add(&self, name: &str, rgb: &RgbImage, world_from_camera: &DMat4) -> Result<()> {
-        write_png(&self.dir.join("rgb").join(format!("{name}.png")), rgb)?;
+        write_png(&self.pictures().join(format!("{name}.png")), rgb)?;
         self.pose(name, world_from_camera)
     }
 
     /// Writes `pose/<name>.txt`, every digit of it.
     pub(crate) fn pose(&self, name: &str, world_from_camera: &DMat4) -> Result<()> {
-        let path = self.dir.join("pose").join(format!("{name}.txt"));
+        let path = self.new.join("pose").join(format!("{name}.txt"));
         let row = |r: usize| world_from_camera.row(r).to_array().map(|x| format!("{x:?}")).join(" ");
         std::fs::write(&path, [0, 1, 2, 3].map(row).join("\n") + "\n").at(&path)
+    }
+}
+
+impl Drop for InstanceWriter {
+    /// What was not finished leaves nothing; nor does an object without views.
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.new);
+        let _ = std::fs::remove_dir(&self.dir);
     }
 }
 
@@ -451,6 +489,7 @@ mod tests {
         for (i, (pose, picture)) in poses.iter().zip(&pictures).enumerate() {
             writer.add(&format!("{i:06}"), picture, pose).unwrap();
         }
+        writer.finish().unwrap();
         (dir, poses, pictures)
     }
 
@@ -618,8 +657,16 @@ mod tests {
         old.iter().for_each(|path| write(path, "of the old views").unwrap());
         assert!(matches!(InstanceWriter::create(&thing, &INTRINSICS, false), Err(Error::Exists { .. })));
         assert_eq!(SrnSet::open(&thing).unwrap().instances[0].views.len(), 3);
-        let writer = InstanceWriter::create(&thing, &INTRINSICS, true).unwrap();
-        writer.add("new", &pictures[0], &uniform_sphere(1, 1.0, 0)[0]).unwrap();
+        // What ends before it is done changes nothing.
+        let new = || {
+            let writer = InstanceWriter::create(&thing, &INTRINSICS, true).unwrap();
+            writer.add("new", &pictures[0], &uniform_sphere(1, 1.0, 0)[0]).unwrap();
+            writer
+        };
+        drop(new());
+        assert_eq!(SrnSet::open(&thing).unwrap().instances[0].views.len(), 3);
+        assert!(old.iter().all(|path| path.exists()) && !thing.join(NEW).exists());
+        new().finish().unwrap();
         assert_eq!(SrnSet::open(&thing).unwrap().instances[0].views.len(), 1, "old views stayed");
         assert!(old.iter().all(|path| !path.exists()));
         assert_eq!(std::fs::read_to_string(notes).unwrap(), "mine");

@@ -129,6 +129,7 @@ pub fn run(args: &Render) -> Result<bool> {
             for (i, (picture, pose)) in pictures.iter().zip(&poses).enumerate() {
                 writer.add(&format!("{i:06}"), picture, pose)?;
             }
+            writer.finish()?;
         }
     }
     print(&format!("{}: {} of {}, {side}×{side}", args.out.display(), poses.len(), model.instance_name(instance)))?;

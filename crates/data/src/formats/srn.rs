@@ -78,7 +78,7 @@ pub(super) fn write(capture: &Capture, dir: PathBuf, axes: Axes, options: &Write
     let mut cameras = vec![];
     let mut unmasked = 0;
     for frame in &capture.frames {
-        match write_picture(frame, &dir, options, &mut written.warnings, &mut unmasked) {
+        match write_picture(frame, &writer.pictures(), options, &mut written.warnings, &mut unmasked) {
             Ok(Some(camera)) => cameras.push((frame.name.as_str(), camera)),
             Ok(None) => written.skipped.push(format!("{}: the mask is empty", frame.image.display())),
             // A bad picture is left out; a full disk is not.
@@ -101,6 +101,9 @@ pub(super) fn write(capture: &Capture, dir: PathBuf, axes: Axes, options: &Write
     }
     cameras.iter().try_for_each(|(name, camera)| writer.pose(name, &axes.of_ours(camera.world_from_camera)))?;
     written.views = cameras.len();
+    if written.views > 0 {
+        writer.finish()?;
+    }
     Ok(written)
 }
 
@@ -116,16 +119,15 @@ fn sphere(camera: &Camera) -> Option<Vec<DVec2>> {
 /// Writes a picture as it is where nothing must be done to it; gives its camera, or nothing where the object is not seen.
 fn write_picture(
     frame: &Frame,
-    dir: &Path,
+    folder: &Path,
     options: &WriteOptions,
     warnings: &mut Vec<String>,
     unmasked: &mut usize,
 ) -> Result<Option<Camera>> {
     let camera = frame.camera.with_pixel_centre(0.0);
-    let folder = dir.join("rgb");
     if options.side.is_none() && frame.mask.is_none() && camera.is_pinhole() && is_picture(&frame.image) {
         decode(&frame.image)?;
-        return super::copy_picture(frame, &folder, &frame.name, false).map(|_| Some(camera));
+        return super::copy_picture(frame, folder, &frame.name, false).map(|_| Some(camera));
     }
     let mut picture = Picture::open(&frame.image, frame.mask.as_deref())?;
     let to = match options.side {
