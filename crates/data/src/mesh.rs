@@ -51,6 +51,8 @@ pub struct Mesh {
     pub textures: Vec<RgbaImage>,
     /// What was left out of the file, one line each.
     pub warnings: Vec<String>,
+    /// Triangles left out, for their corners are no numbers, or too large for any.
+    not_finite: usize,
 }
 
 /// Which axis of a file points up.
@@ -99,7 +101,9 @@ pub fn load(path: &Path) -> Result<(Mesh, Up)> {
 impl Mesh {
     /// Adds a triangle with a flat normal to the last part. Degenerate triangles are dropped.
     pub(crate) fn push_flat(&mut self, corners: [Vec3; 3], colour: Vec3) {
-        let normal = (corners[1] - corners[0]).cross(corners[2] - corners[0]).normalize_or_zero();
+        let across = (corners[1] - corners[0]).cross(corners[2] - corners[0]);
+        self.not_finite += usize::from(!across.is_finite());
+        let normal = across.normalize_or_zero();
         if normal != Vec3::ZERO {
             self.vertices.extend(corners.map(|position| Vertex { position, normal, colour, uv: Vec2::ZERO }));
         }
@@ -112,7 +116,14 @@ impl Mesh {
             vertex.uv = if vertex.uv.is_finite() { vertex.uv } else { Vec2::ZERO };
             vertex.colour = if vertex.colour.is_finite() { vertex.colour } else { Vec3::ZERO };
         }
-        if self.vertices.is_empty() { Err(Error::field(path, "faces", "at least one", "none")) } else { Ok(self) }
+        if self.not_finite > 0 {
+            self.warnings.push(format!("{} faces left out: corners that are no numbers, or too large", self.not_finite));
+        }
+        if self.vertices.is_empty() {
+            let found = self.warnings.first().map_or("none".into(), |why| format!("none: {why}"));
+            return Err(Error::field(path, "faces", "at least one", found));
+        }
+        Ok(self)
     }
 
     /// An error where the mesh has grown beyond all measure.

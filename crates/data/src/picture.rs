@@ -116,18 +116,17 @@ impl Picture {
 /// as background removers write it, is opaque there. A mask of black and one other value says the same, whatever that is: segmentations are also written with
 /// the number of the object, or in a colour.
 pub(crate) fn read_mask(path: &Path, [width, height]: [u32; 2]) -> Result<Vec<u8>> {
-    let mask = decode(path)?.into_luma_alpha8();
+    // Of 16 bits all count: there, too, a segmentation may have the number of the object.
+    let mask = decode(path)?.into_luma_alpha16();
     if mask.dimensions() != (width, height) {
         let expected = format!("{width}×{height}, as its picture");
         return Err(Error::field(path, "size", expected, format!("{}×{}", mask.width(), mask.height())));
     }
-    let channel = usize::from(mask.pixels().any(|mask| mask[1] < 255));
-    let mut mask: Vec<u8> = mask.pixels().map(|mask| mask[channel]).collect();
-    let white = mask.iter().copied().max().unwrap_or(0);
-    if mask.iter().all(|&value| value == 0 || value == white) {
-        mask.iter_mut().filter(|value| **value > 0).for_each(|value| *value = 255);
-    }
-    Ok(mask)
+    let channel = usize::from(mask.pixels().any(|mask| mask[1] < u16::MAX));
+    let values = || mask.pixels().map(|mask| mask[channel]);
+    let white = values().max().unwrap_or(0);
+    let is_label = values().all(|value| value == 0 || value == white);
+    Ok(values().map(|value| if is_label { 255 * u8::from(value > 0) } else { (value / 257) as u8 }).collect())
 }
 
 /// The corners of the box around points; `None` without points.

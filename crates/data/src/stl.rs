@@ -44,6 +44,7 @@ mod tests {
             let mesh = load(&path).unwrap();
             assert_eq!(mesh.vertices.iter().map(|v| v.position.to_array()).collect::<Vec<_>>(), corners);
             assert_eq!((mesh.vertices[0].normal, mesh.parts.len()), (Vec3::Z, 1));
+            assert_eq!(mesh.warnings.len(), usize::from(bytes == binary), "{:?}", mesh.warnings);
             std::fs::write(&path, &bytes[..90]).unwrap();
             let error = load(&path).unwrap_err().to_string();
             assert!(error.contains("mesh.stl") && error.contains("STL"), "{error}");

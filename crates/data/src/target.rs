@@ -246,6 +246,19 @@ mod tests {
         assert_eq!(masked.rgb[96..], [1.0; 96]);
     }
 
+    /// Of 16 bits, too.
+    #[test]
+    fn a_mask_may_have_the_number_of_the_object() {
+        let dir = tempfile::tempdir().unwrap();
+        let object = |x: u32, y: u32| u16::from((41..51).contains(&x) && (6..12).contains(&y));
+        let label = saved(dir.path(), "label.png", image::ImageBuffer::from_fn(60, 40, |x, y| Luma([object(x, y)])));
+        let white = saved(dir.path(), "white.png", GrayImage::from_fn(60, 40, |x, y| Luma([255 * object(x, y) as u8])));
+        let grey = saved(dir.path(), "grey.png", image::ImageBuffer::from_fn(60, 40, |x, y| Luma([(257 * x + y) as u16])));
+        let [label, white, grey] = [label, white, grey].map(|mask| counts(&mask, [60, 40]).unwrap());
+        assert_eq!(label, white);
+        assert_eq!(grey[17], 17.0 / 255.0);
+    }
+
     #[test]
     fn masks_that_do_not_fit_are_named() {
         let dir = tempfile::tempdir().unwrap();

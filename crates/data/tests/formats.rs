@@ -242,6 +242,9 @@ fn srn_archives_are_read_as_they_are_found() {
         assert_eq!(set.instances[0].views[1].intrinsics.map(f64::from), expected);
     }
 
+    let dir = srn(&[("intrinsics.txt", "21 5 8.5\n0 22 7.5\n0 0 1\n")]);
+    let error = formats::read(dir.path(), Format::Srn, &ReadOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("intrinsics.txt") && error.contains("skew"), "{error}");
     // No intrinsics at all: the angle of view says them.
     let dir = srn(&[("intrinsics.txt", "")]);
     let error = formats::read(dir.path(), Format::Srn, &ReadOptions::default()).unwrap_err().to_string();
@@ -831,7 +834,7 @@ fn bad_files_are_named_with_the_place() {
             Box::new(swap("\"OPENCV\"", "\"OPENCV_FISHEYE\"")),
             &["frames[0]", "camera_model", "FISHEYE"],
         ),
-        (Format::Transforms, "transforms.json", Box::new(swap("\"fl_x\": 14.4", "\"fl_x\": NaN")), &["line ", "column"]),
+        (Format::Transforms, "transforms.json", Box::new(swap("\"fl_x\": 14.4", "\"fl_x\": NaN")), &["line ", "column", "NaN"]),
         (Format::Transforms, "transforms.json", Box::new(swap("\"fl_x\": 14.4", "\"fl_x\": -2")), &["above 0", "-2"]),
         (
             Format::Transforms,

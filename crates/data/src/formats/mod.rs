@@ -378,6 +378,10 @@ pub(crate) fn from_json<T: serde::de::DeserializeOwned>(path: &Path, text: &str)
         let place = format!("line {}, column {}", error.line(), error.column());
         let whole = error.to_string();
         let what = whole.rsplit_once(" at line ").map_or(whole.as_str(), |(what, _)| what);
+        // What some write for numbers that are none.
+        let line = text.lines().nth(error.line().saturating_sub(1)).unwrap_or_default().as_bytes();
+        let rest = line.get(error.column().saturating_sub(1)..).unwrap_or_default();
+        let what = ["NaN", "Infinity"].into_iter().find(|word| rest.starts_with(word.as_bytes())).unwrap_or(what);
         Error::field(path, place, "the fields of this format in JSON", what)
     })
 }
