@@ -177,9 +177,12 @@ pub fn refuse_existing(paths: impl IntoIterator<Item = PathBuf>, force: bool) ->
     }
 }
 
-/// Fails if a file is there already, or has no folder to be in that can be written to: found out now rather than after the work.
+/// Fails if a file is there already, or a folder in its place, or it has no folder to be in that can be written to: found out now rather than after the work.
 pub fn refuse_to_write(path: &Path, force: bool) -> Result<()> {
     refuse_existing([path.to_owned()], force)?;
+    if path.is_dir() {
+        return Err(format!("{}: a folder, and is to be a file", path.display()).into());
+    }
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if !folder.is_dir() {
         return Err(format!("{}: its folder does not exist", path.display()).into());

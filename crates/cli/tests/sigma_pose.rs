@@ -160,6 +160,7 @@ fn a_calibrated_model_states_deviations() {
     let home = home();
     let dir = home.path();
     fail(dir, "calibrate --model model.safetensors --data DATA --out model.safetensors", &["model.safetensors", "--force"]);
+    fail(dir, "calibrate --model model.safetensors --data DATA --out . --force", &[".: a folder"]);
     // Instances have names, so a folder called `1` is not the second of them.
     copy_views("seat", &["000003"], &dir.join("numbered/1"));
     fail(
@@ -306,7 +307,10 @@ fn frames_come_on_stdin() {
         assert_eq!((answer["frame"].as_str(), &answer["searched"]), (Some(&path[..]), &Value::Bool(false)));
     }
     // Whatever a path may be made of.
-    for (path, shown) in [(&b"no-such.png"[..], "no-such.png"), (b"\xff.png", "\u{fffd}.png")] {
+    let of_another = format!("{TEST}/seat/rgb/000003.png");
+    for (path, shown) in
+        [(&b"no-such.png"[..], "no-such.png"), (b"\xff.png", "\u{fffd}.png"), (of_another.as_bytes(), "shows seat")]
+    {
         frames.write_all(&[path, b"\n"].concat()).unwrap();
         let answer: Value = serde_json::from_str(&poses.next().unwrap().unwrap()).unwrap();
         assert!(answer["trusted"] == false && answer["failure"].as_str().unwrap().contains(shown), "{answer}");
@@ -343,6 +347,7 @@ fn tables_hold_every_preset() {
     fail(dir, &format!("{args} --tables tables"), &["tables.md", "--force"]);
     fail(dir, &format!("{} --tables other", args.replace("heldout DATA", "heldout two")), &["seat", "has 2 views"]);
     fail(dir, &format!("{args} --tables other --preset paper"), &["--tables", "--radius"]);
+    fail(dir, &format!("{args} --json"), &["--heldout", "--tables"]);
     fail(dir, &format!("{args} --starts fixed24 --tables other"), &["--starts", "--tables"]);
 }
 
@@ -509,7 +514,7 @@ fn bad_calls_end_with_2_and_one_line() {
         (format!("{image} {model} --unseen --steps 3"), &["--unseen", "--steps"]),
         (format!("estimate white.png {model} --fov 40 --instance seat"), &["white.png", "nothing but white"]),
         (format!("track DATA/chicken/rgb {model} --truth short.txt"), &["--truth", "one frame"]),
-        (format!("bake {model} --instance seat --out . --force"), &["something else than a file"]),
+        (format!("bake {model} --instance seat --out . --force"), &[".: a folder"]),
         (format!("{image} {model} --stride 100 --executor cpu"), &["chicken-000003", "stride"]),
         (format!("{image} {model} --preset paper --loss gmsd --stride 2 --executor cpu"), &["stride 1"]),
         (format!("{image} {model} --memory 1 --executor cpu"), &["budget of 1 bytes"]),
@@ -890,6 +895,12 @@ fn an_unknown_object_has_no_known_deviations() {
     assert!(losses.len() == 3 && losses.is_sorted() && losses[0] == found["loss"].as_f64().unwrap(), "{found}");
     assert!(found["rival"]["higher"].as_f64().unwrap() < 0.3 && found["trusted"] == false, "{found}");
     assert!(found["confidence"].is_null(), "{found}");
+    // Also where something speaks against --unseen.
+    fail(
+        dir,
+        &format!("{} --effort fast --save-model no.safetensors", args.replace("--unseen", "--instance seat")),
+        &["--unseen"],
+    );
     let found = first(&format!("{args} --accept 9 --save-model new.safetensors"), 0);
     assert_eq!(found["trusted"], true);
     assert_eq!(Model::load(&dir.join("new.safetensors")).unwrap().metadata.instance_names, ["unseen"]);

@@ -8,7 +8,7 @@ use sigma_cli::pose::{bake, calibrate, estimate, evaluate, render, track};
 
 /// Camera poses of pictures by gradient descent through a neural renderer.
 ///
-/// Exit status: 0 done, 1 `estimate` found a pose that is not to be trusted, 2 an error.
+/// Exit status: 0 done, 1 `estimate` or `track` found a pose that is not to be trusted, 2 an error.
 #[derive(Parser)]
 #[command(name = "sigma-pose", version, about)]
 struct Cli {

@@ -16,7 +16,9 @@ use super::notation::{Notation, NotationArgs, ObjectPose};
 use super::outline;
 use super::record::Log;
 use super::search::{On, PoseError, SearchArgs, Starts, deviation, run as search, within_95};
-use crate::common::{EngineArgs, Result, create_dir, load_model, lossy, print, progress, refuse_existing, refuse_to_write};
+use crate::common::{
+    EngineArgs, Result, about_model, create_dir, load_model, lossy, print, progress, refuse_existing, refuse_to_write,
+};
 
 /// Pictures that are searched for side by side, enough to fill a large GPU. What was found of them is printed before the next ones are looked at.
 const AT_ONCE: usize = 32;
@@ -35,7 +37,7 @@ pub struct Estimate {
     #[arg(long, conflicts_with_all = ["instance", "record", "preset", "effort", "loss", "steps", "lr", "cull", "no_cull", "stride"])]
     unseen: bool,
     /// With --unseen and one picture: write the model with this object, for further pictures of it.
-    #[arg(long, value_name = "FILE", requires = "unseen")]
+    #[arg(long, value_name = "FILE")]
     save_model: Option<PathBuf>,
     /// What of a picture is the object, as a segmentation says: white, or opaque. What is black becomes background, as what is transparent does, so that the
     /// object's outline helps. A file, once or once per picture, or a folder with files called like the pictures.
@@ -62,7 +64,7 @@ pub struct Estimate {
     /// Write to this folder, of each search, a picture, an animation, and the found object's outline on the picture as it was given.
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
-    /// Overwrite pictures in the folder of --record.
+    /// Overwrite pictures in the folder of --record, and the file of --save-model.
     #[arg(long)]
     force: bool,
     #[command(flatten)]
@@ -148,6 +150,9 @@ struct RankedReport {
 /// Runs the command; false where a pose is not to be trusted.
 pub fn run(args: &Estimate) -> Result<bool> {
     let model = load_model(&args.object.model)?;
+    if args.unseen {
+        model.hypernetwork().map_err(|error| about_model(&args.object.model, error))?;
+    }
     let side = model_side(&model, &args.images[0])?;
     let notation = args.poses.open()?;
     let rough = poses("--rough", &args.rough, &args.images, &notation)?;
@@ -169,20 +174,22 @@ pub fn run(args: &Estimate) -> Result<bool> {
         create_dir(dir)?;
     }
     if let Some(path) = &args.save_model {
-        if pictures.len() > 1 {
-            return Err("--save-model is for one picture".into());
+        // Not by clap, whose `requires` is silent where something else conflicts with what is required.
+        if !args.unseen || pictures.len() > 1 {
+            return Err("--save-model is for --unseen and one picture".into());
         }
         refuse_to_write(path, args.force)?;
     }
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
     let mut output = Output { args, on, notation: &notation, pictures: &pictures, sources: &sources, images: vec![] };
-    if args.unseen {
-        unseen(&starts, &mut output)?;
-    } else {
-        searched(&starts, &mut output)?;
+    let done = if args.unseen { unseen(&starts, &mut output) } else { searched(&starts, &mut output) };
+    // Poses that were found are told, also where a picture of them could not be written.
+    if done.is_err() && output.images.is_empty() {
+        return done.map(|()| false);
     }
-    output.end()
+    let is_trusted = output.end()?;
+    done.map(|()| is_trusted)
 }
 
 /// Poses of pictures of objects in the model.
@@ -203,10 +210,12 @@ fn searched(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
         })?;
         (left, before) = (left - 1, bar.position());
         bar.set_message("");
-        for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
+        for (picture, found) in pictures.iter().zip(&found) {
             let starts = found.estimate.ranking.len();
             output.add(on.model.instance_name(picture.instance), found, starts, &bar)?;
-            if let Some(dir) = &args.record {
+        }
+        if let Some(dir) = &args.record {
+            for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
                 log.write(dir, i, picture, found, on)?;
                 outline::write(dir, &args.images[first + i], picture, found, on)?;
             }
@@ -233,10 +242,10 @@ fn unseen(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
             Ok(())
         };
         let (found, fitted) = args.search.run_unseen(on, picture, starts, observe)?;
+        output.add("unseen".into(), &found, starts.len(), &bar)?;
         if let Some(path) = &args.save_model {
             fitted.save(path)?;
         }
-        output.add("unseen".into(), &found, starts.len(), &bar)?;
     }
     bar.finish_and_clear();
     Ok(())

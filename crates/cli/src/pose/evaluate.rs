@@ -17,7 +17,7 @@ use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::tables;
 use super::views;
-use crate::common::{EngineArgs, Result, create_dir, load_model, print, refuse_existing, write_picture};
+use crate::common::{EngineArgs, Result, create_dir, load_model, print, refuse_existing, refuse_to_write, write_picture};
 
 /// Side of a view on the sheet, pixels.
 const SHOWN: u32 = 128;
@@ -49,11 +49,11 @@ pub struct Evaluate {
     #[arg(long, value_name = "DIR", conflicts_with_all = ["starts", "json", "out"])]
     pub(super) tables: Option<PathBuf>,
     /// For --tables: instances that the model was not trained on; they are fitted to two views each (the paper's Table 2).
-    #[arg(long, value_name = "DIR", requires = "tables")]
+    #[arg(long, value_name = "DIR")]
     pub(super) heldout: Option<PathBuf>,
     /// For --tables: for how many of the views the paper's preset searches from `neighbor4`, half a minute a view on a CPU; from
     /// `fixed24`, six times the work, for a sixth of them. Default: all.
-    #[arg(long, value_name = "N", requires = "tables", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) paper_views: Option<u32>,
     /// Count poses as right from which the object looks the same: turns about its axes that the model's own views do not show. Some
     /// seconds per instance on a CPU.
@@ -124,6 +124,9 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     if let Some(dir) = &args.tables {
         return tables::write(args, dir);
     }
+    if args.heldout.is_some() || args.paper_views.is_some() {
+        return Err("--heldout and --paper-views are for --tables".into());
+    }
     let model = load_model(&args.model)?;
     let (side, asked) = views::open(&model, &args.data, args.instances, args.views)?;
     let notation = args.poses.open()?;
@@ -132,6 +135,7 @@ pub fn run(args: &Evaluate) -> Result<bool> {
     if let Some(dir) = &args.out {
         refuse_existing(files.map(|file| dir.join(file)), args.force)?;
         create_dir(dir)?;
+        files.iter().try_for_each(|file| refuse_to_write(&dir.join(file), args.force))?;
     }
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };

@@ -29,8 +29,8 @@ const PATIENCE: Duration = Duration::from_secs(1);
 #[derive(Args, Debug)]
 pub struct Track {
     /// Frames in order, as `estimate` takes them; or a folder, whose pictures are taken by name and number; or `-`: their paths come on stdin, one per
-    /// line, and each is answered before the next is read. One after the first that is no picture, or has nothing of the object, is said to be so, and
-    /// the next is taken.
+    /// line, and each is answered before the next is read. One after the first that is no picture, shows another object, or nothing of it, is said to
+    /// be so, and the next is taken.
     #[arg(required = true, value_name = "FRAME|DIR|-")]
     frames: Vec<PathBuf>,
     #[command(flatten)]
@@ -47,7 +47,7 @@ pub struct Track {
     /// True pose of every frame, to report errors; `auto`: the one in the frame's SRN folder.
     #[arg(long, value_name = "auto")]
     truth: Option<PoseSource>,
-    /// Print a line of JSON per frame.
+    /// Print a line of JSON per frame; one that is no picture has `frame`, `trusted` and `failure` alone.
     #[arg(long)]
     json: bool,
     /// Write an animation as it grows: each frame beside the view from its pose.
@@ -110,12 +110,19 @@ pub fn run(args: &Track) -> Result<bool> {
     let side = model_side(&model, &first)?;
     warn_of_turned(&first);
     let mut animation = None;
-    let mut tracker = None;
+    let (mut tracker, mut followed) = (None, None);
     let (mut errors, mut searches, mut trusted, mut count) = (Vec::new(), 0, true, 0);
     for path in std::iter::once(Ok(first)).chain(frames) {
         let path = path?;
         let masks = Masks { cutout: args.cutout.as_deref(), mask: args.mask.as_deref() };
         let picture = Picture::open(&path, masks, &model, side, args.object.instance.as_deref(), &args.object.camera);
+        let name = |number| model.instance_name(number);
+        let picture = picture.and_then(|picture| match followed {
+            Some(followed) if picture.instance != followed => {
+                Err(format!("{}: shows {}, but {} is followed", path.display(), name(picture.instance), name(followed)).into())
+            }
+            _ => Ok(picture),
+        });
         let picture = match picture {
             Ok(picture) => picture,
             // The first says whether the flags are right; later ones come from a camera that may have lost the object.
@@ -132,6 +139,14 @@ pub fn run(args: &Track) -> Result<bool> {
             }
             Err(error) => return Err(error),
         };
+        let truth = match args.truth.as_ref().map(|truth| truth.read(&path, &notation)).transpose() {
+            Err(error) if tracker.is_some() => {
+                eprintln!("warning: {error}");
+                None
+            }
+            truth => truth?,
+        };
+        followed = Some(picture.instance);
         let starts = args.search.starts(&Starts::Around84, &model, &picture, side, None, &notation)?;
         let tracker = match &mut tracker {
             Some(tracker) => tracker,
@@ -158,7 +173,6 @@ pub fn run(args: &Track) -> Result<bool> {
         let Tracked { found, is_searched: searched } = tracked?;
         trusted = found.is_trusted();
         let mask = MadeRight::of(&found.estimate, picture.pixels_on_disk(side));
-        let truth = args.truth.as_ref().map(|truth| truth.read(&path, &notation)).transpose()?;
         let error = truth.map(|truth| notation.error(PoseError::of(&found.world_from_camera, &truth)));
         errors.extend(error);
         searches += usize::from(searched);
