@@ -66,14 +66,17 @@ pub fn motion(from: &DMat4, to: &DMat4) -> [f64; 6] {
 }
 
 impl Calibration {
-    /// [`Calibration::floor`] for an estimate. In a smaller picture of the object errors grow as a pixel does; and how far away it is, which
-    /// shows in how large it is, is known to a part of the distance.
+    /// [`Calibration::floor`] for an estimate: how far away it is, which shows in how large it is, is known to a part of the distance.
     fn floor_of(&self, estimate: &Estimate) -> [f64; 6] {
-        let Some(seen) = self.seen else { return self.floor };
-        let pixel = (seen.extent / estimate.extent).max(1.0);
-        let farther = (estimate.pose.distance() / seen.distance).max(1.0);
-        let [a, b, c, x, y, z] = self.floor.map(|variance| pixel * pixel * variance);
+        let farther = self.seen.map_or(1.0, |seen| (estimate.pose.distance() / seen.distance).max(1.0));
+        let [a, b, c, x, y, z] = self.floor;
         [a, b, c, x, y, farther * farther * z]
+    }
+
+    /// How much larger variances are where the object is smaller in the picture: errors grow as a pixel does, and by as many fewer pixels are not made up
+    /// for; by views from farther away (`docs/accuracy.md`).
+    fn of_pixels(&self, estimate: &Estimate) -> f64 {
+        self.seen.map_or(1.0, |seen| (seen.extent / estimate.extent).max(1.0).powi(3))
     }
 }
 
@@ -92,7 +95,7 @@ impl Estimate {
         // Second derivatives know of the pixels that are missing where a part is hidden, but not of all: errors of the model average over fewer, and
         // what is left says less of how far away it is. So much covers them (`docs/accuracy.md`).
         let of_picture = if self.is_without_outline { WITHOUT_OUTLINE } else { 1.0 / self.in_sight };
-        let size = of_picture * calibration.sizes.get(instance).copied().unwrap_or(1.0);
+        let size = of_picture * calibration.of_pixels(self) * calibration.sizes.get(instance).copied().unwrap_or(1.0);
         let mixed = mixed(&self.shape()?, calibration.curvature, &calibration.floor_of(self));
         let mut covariance = mixed.map(|row| row.map(|entry| size * entry));
         if let Some(outline) = self.outline {
@@ -274,7 +277,7 @@ mod tests {
         };
         assert_eq!(variances(None), [1.0; 3]);
         assert_eq!(variances(Some(Seen { distance: 1.3, extent: 0.5 })), [1.0, 1.0, 4.0]);
-        assert_eq!(variances(Some(Seen { distance: 1.3, extent: 1.5 })), [9.0, 9.0, 36.0]);
+        assert_eq!(variances(Some(Seen { distance: 1.3, extent: 1.5 })), [27.0, 27.0, 108.0]);
         assert_eq!(variances(Some(Seen { distance: 5.2, extent: 0.1 })), [1.0; 3]);
         let known = Calibration { seen: Some(Seen { distance: 1.3, extent: 0.9 }), ..known };
         assert_eq!([0.4, 0.5].map(|extent| known.is_small(extent)), [true, false]);
