@@ -73,8 +73,8 @@ impl Calibration {
         [a, b, c, x, y, farther * farther * z]
     }
 
-    /// How much larger variances are where the object is smaller in the picture: errors grow as a pixel does, and by as many fewer pixels are not made up
-    /// for; by views from farther away (`docs/accuracy.md`).
+    /// How much larger variances are where an object is smaller in the picture than those of the calibration. The square of a pixel's size would do if errors
+    /// grew as a pixel does; by views from farther away (`docs/accuracy.md`) they grow faster.
     fn of_pixels(&self, estimate: &Estimate) -> f64 {
         self.seen.map_or(1.0, |seen| (seen.extent / estimate.extent).max(1.0).powi(3))
     }

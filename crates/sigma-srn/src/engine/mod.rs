@@ -145,7 +145,7 @@ impl Engine {
         Builder::new(self.max_binding_bytes())
     }
 
-    /// So many rows: the product.
+    /// The product, or an error where that is too large to count rows with.
     pub(crate) fn rows<const N: usize>(factors: [u32; N]) -> Result<u32, Error> {
         let product = factors.into_iter().try_fold(1u32, u32::checked_mul);
         product.ok_or_else(|| Error::Setting { field: "rays", what: format!("{factors:?} are more than {} at once", u32::MAX) })
