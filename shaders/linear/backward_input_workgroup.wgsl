@@ -23,9 +23,10 @@ struct Params {
 @group(0) @binding(4) var<storage, read_write> d_x: array<vec4<f32>>;
 
 // Sixteen output features of a tile, each of 64 rows and of 64 input features, in vectors of four. Where the vector of four rows stands among the
-// sixteen of its feature is crossed with the feature's number, so that eight successive invocations write to different banks.
-var<workgroup> y_tile: array<vec4<f32>, 256>;
-var<workgroup> w_tile: array<vec4<f32>, 256>;
+// sixteen of its feature is crossed with the feature's number, so that eight successive invocations write to different banks. An array for each
+// feature: a first index that is known needs no check, and those of the second are the same for all features that are crossed alike.
+var<workgroup> y_tile: array<array<vec4<f32>, 16>, 16>;
+var<workgroup> w_tile: array<array<vec4<f32>, 16>, 16>;
 
 // Where the weights of a group begin, in elements.
 fn weights_of(group: u32) -> u32 {
@@ -49,12 +50,12 @@ struct Sums {
 }
 
 // Adds the products of feature k of the sixteen.
-fn multiply_add(sums: ptr<function, Sums>, local: vec3<u32>, k: u32) {
+fn multiply_add(sums: ptr<function, Sums>, local: vec2<u32>, k: u32) {
     let crossed = 2u * (k / 4u);
-    let ya = y_tile[16u * k + (local.y ^ crossed)];
-    let yb = y_tile[16u * k + ((local.y + 8u) ^ crossed)];
-    let wa = w_tile[16u * k + local.x];
-    let wb = w_tile[16u * k + local.x + 8u];
+    let ya = y_tile[k][local.y ^ crossed];
+    let yb = y_tile[k][(local.y + 8u) ^ crossed];
+    let wa = w_tile[k][local.x];
+    let wb = w_tile[k][local.x + 8u];
     (*sums).aa += outer(ya, wa);
     (*sums).ab += outer(ya, wb);
     (*sums).ba += outer(yb, wa);
@@ -81,14 +82,23 @@ fn store(part: u32, row: u32, in_: u32, tile: mat4x4<f32>) {
     put(part, row + 3u, in_, tile[3]);
 }
 
-@compute @workgroup_size(8, 8)
+// Where an invocation stands among eight by eight. Of four neighbours two load the same vectors of rows, and two the same of features: NVIDIA's GPUs
+// load such pairs together.
+fn place(index: u32) -> vec2<u32> {
+    return vec2((index & 1u) | ((index >> 1u) & 6u), ((index >> 1u) & 1u) | ((index >> 3u) & 6u));
+}
+
+@compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(local_invocation_id) local: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) index: u32,
 ) {
-    let first_row = 64u * workgroup.x;
-    let first_in = 64u * workgroup.y;
+    let local = place(index);
+    // One after the other those that read the same rows.
+    let number = workgroup.y * workgroups.x + workgroup.x;
+    let first_row = 64u * (number / workgroups.y);
+    let first_in = 64u * (number % workgroups.y);
     let part = workgroup.z;
     let group = part / params.chunks;
     let begin = part % params.chunks * params.chunk_outs;
@@ -98,9 +108,11 @@ fn main(
     let n = params.out_features / 4u;
     let stride = params.in_features / 4u;
     let y_row = group * params.rows_per_group + min(first_row + 4u * (index / 4u) + vec4(0u, 1u, 2u, 3u), vec4(params.rows_per_group - 1u));
-    let y_to = 64u * (index % 4u) + ((index / 4u) ^ (2u * (index % 4u)));
+    let y_k = 4u * (index % 4u);
+    let y_to = (index / 4u) ^ (2u * (index % 4u));
     let w_column = weights_of(group) / 4u + min(first_in / 4u + index % 16u, stride - 1u);
-    let w_to = 64u * (index / 16u) + index % 16u;
+    let w_k = 4u * (index / 16u);
+    let w_to = index % 16u;
 
     var sums: Sums;
     let last = end / 4u - 1u;
@@ -112,14 +124,14 @@ fn main(
         let ys = transpose(mat4x4(d_y[y_at.x], d_y[y_at.y], d_y[y_at.z], d_y[y_at.w])) * within;
         let ws = mat4x4(weights[w_at], weights[w_at + stride], weights[w_at + 2u * stride], weights[w_at + 3u * stride]);
         workgroupBarrier();
-        y_tile[y_to] = ys[0];
-        y_tile[y_to + 16u] = ys[1];
-        y_tile[y_to + 32u] = ys[2];
-        y_tile[y_to + 48u] = ys[3];
-        w_tile[w_to] = ws[0];
-        w_tile[w_to + 16u] = ws[1];
-        w_tile[w_to + 32u] = ws[2];
-        w_tile[w_to + 48u] = ws[3];
+        y_tile[y_k][y_to] = ys[0];
+        y_tile[y_k + 1u][y_to] = ys[1];
+        y_tile[y_k + 2u][y_to] = ys[2];
+        y_tile[y_k + 3u][y_to] = ys[3];
+        w_tile[w_k][w_to] = ws[0];
+        w_tile[w_k + 1u][w_to] = ws[1];
+        w_tile[w_k + 2u][w_to] = ws[2];
+        w_tile[w_k + 3u][w_to] = ws[3];
         workgroupBarrier();
         multiply_add(&sums, local, 0u);
         multiply_add(&sums, local, 1u);

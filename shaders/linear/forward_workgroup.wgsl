@@ -23,9 +23,10 @@ struct Params {
 @group(0) @binding(4) var<storage, read_write> y: array<vec4<f32>>;
 
 // Sixteen input features of a tile, each of 64 rows and of 64 output features, in vectors of four. Where a vector stands among the sixteen of its
-// feature is crossed with the feature's number, so that eight successive invocations write to different banks.
-var<workgroup> x_tile: array<vec4<f32>, 256>;
-var<workgroup> w_tile: array<vec4<f32>, 256>;
+// feature is crossed with the feature's number, so that eight successive invocations write to different banks. An array for each feature: a first
+// index that is known needs no check, and those of the second are the same for all features that are crossed alike.
+var<workgroup> x_tile: array<array<vec4<f32>, 16>, 16>;
+var<workgroup> w_tile: array<array<vec4<f32>, 16>, 16>;
 
 // Where the weights of a group begin, in elements.
 fn weights_of(group: u32) -> u32 {
@@ -49,12 +50,12 @@ struct Sums {
 }
 
 // Adds the products of feature k of the sixteen.
-fn multiply_add(sums: ptr<function, Sums>, local: vec3<u32>, k: u32) {
+fn multiply_add(sums: ptr<function, Sums>, local: vec2<u32>, k: u32) {
     let crossed = 2u * (k / 4u);
-    let xa = x_tile[16u * k + (local.y ^ crossed)];
-    let xb = x_tile[16u * k + ((local.y + 8u) ^ crossed)];
-    let wa = w_tile[16u * k + (local.x ^ crossed)];
-    let wb = w_tile[16u * k + ((local.x + 8u) ^ crossed)];
+    let xa = x_tile[k][local.y ^ crossed];
+    let xb = x_tile[k][(local.y + 8u) ^ crossed];
+    let wa = w_tile[k][local.x ^ crossed];
+    let wb = w_tile[k][(local.x + 8u) ^ crossed];
     (*sums).aa += outer(xa, wa);
     (*sums).ab += outer(xa, wb);
     (*sums).ba += outer(xb, wa);
@@ -82,14 +83,23 @@ fn store(group: u32, row: u32, out: u32, tile: mat4x4<f32>, first_bias: u32) {
     put(group, row + 3u, out, tile[3] + bias);
 }
 
-@compute @workgroup_size(8, 8)
+// Where an invocation stands among eight by eight. Of four neighbours two load the same vectors of rows, and two the same of features: NVIDIA's GPUs
+// load such pairs together.
+fn place(index: u32) -> vec2<u32> {
+    return vec2((index & 1u) | ((index >> 1u) & 6u), ((index >> 1u) & 1u) | ((index >> 3u) & 6u));
+}
+
+@compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(local_invocation_id) local: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) index: u32,
 ) {
-    let first_row = 64u * workgroup.x;
-    let first_out = 64u * workgroup.y;
+    let local = place(index);
+    // One after the other those that read the same rows.
+    let number = workgroup.y * workgroups.x + workgroup.x;
+    let first_row = 64u * (number / workgroups.y);
+    let first_out = 64u * (number % workgroups.y);
     let group = workgroup.z;
     // What this invocation copies: four rows of x and of W, four features of each; the last row stands in for those beyond it.
     let n = params.in_features / 4u;
@@ -98,7 +108,8 @@ fn main(
     let x_row = group * params.rows_per_group + min(first_row + 4u * four + vec4(0u, 1u, 2u, 3u), vec4(params.rows_per_group - 1u));
     let w_first = weights_of(group) / 4u;
     let w_row = min(first_out + 4u * four + vec4(0u, 1u, 2u, 3u), vec4(params.out_features - 1u));
-    let to = 64u * feature + (four ^ (2u * feature));
+    let k = 4u * feature;
+    let to = four ^ (2u * feature);
 
     var sums: Sums;
     for (var first = 0u; first < n; first += 4u) {
@@ -110,14 +121,14 @@ fn main(
         let xs = transpose(mat4x4(x[x_at.x], x[x_at.y], x[x_at.z], x[x_at.w])) * within;
         let ws = transpose(mat4x4(weights[w_first + w_at.x], weights[w_first + w_at.y], weights[w_first + w_at.z], weights[w_first + w_at.w]));
         workgroupBarrier();
-        x_tile[to] = xs[0];
-        x_tile[to + 16u] = xs[1];
-        x_tile[to + 32u] = xs[2];
-        x_tile[to + 48u] = xs[3];
-        w_tile[to] = ws[0];
-        w_tile[to + 16u] = ws[1];
-        w_tile[to + 32u] = ws[2];
-        w_tile[to + 48u] = ws[3];
+        x_tile[k][to] = xs[0];
+        x_tile[k + 1u][to] = xs[1];
+        x_tile[k + 2u][to] = xs[2];
+        x_tile[k + 3u][to] = xs[3];
+        w_tile[k][to] = ws[0];
+        w_tile[k + 1u][to] = ws[1];
+        w_tile[k + 2u][to] = ws[2];
+        w_tile[k + 3u][to] = ws[3];
         workgroupBarrier();
         multiply_add(&sums, local, 0u);
         multiply_add(&sums, local, 1u);

@@ -84,8 +84,6 @@ impl Cooperative {
 pub struct Variant {
     /// Unique within the kernel.
     pub name: &'static str,
-    /// File name without the extension: the name, but for a form that is another one with more or fewer rows to a workgroup.
-    pub file: &'static str,
     /// The WGSL text of the file.
     pub text: &'static str,
     /// Elements of the step's extent that one workgroup covers, per dimension.

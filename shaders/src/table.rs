@@ -12,31 +12,12 @@ macro_rules! element {
     };
 }
 
-/// The file of a variant: its own, or that of another one, which has more or fewer rows to a workgroup.
-macro_rules! file {
-    ($own:literal) => {
-        $own
-    };
-    ($own:literal, $other:literal) => {
-        $other
-    };
-}
-
-macro_rules! text {
-    ($op:literal, $own:literal) => {
-        include_str!(concat!("../", $op, "/", $own, ".wgsl"))
-    };
-    ($op:literal, $own:literal, $other:literal) => {
-        text!($op, $other)
-    };
-}
-
 macro_rules! table {
     ($(
         $(#[$doc:meta])*
         $id:ident = $op:literal / $direction:literal, $params:ident, tile $tile:expr,
         ($($in:ident: $in_ty:ident),*) -> ($($out:ident: $out_ty:ident),*)
-        $(, or $variant:literal $(as $text:literal)? tile $variant_tile:expr, when [$($requires:ident),*])*;
+        $(, or $variant:literal tile $variant_tile:expr, when [$($requires:ident),*])*;
     )*) => {
         $(
             $(#[$doc])*
@@ -52,15 +33,13 @@ macro_rules! table {
                 variants: &[
                     Variant {
                         name: $direction,
-                        file: $direction,
                         text: include_str!(concat!("../", $op, "/", $direction, ".wgsl")),
                         tile: $tile,
                         requires: &[],
                     },
                     $(Variant {
                         name: $variant,
-                        file: file!($variant $(, $text)?),
-                        text: text!($op, $variant $(, $text)?),
+                        text: include_str!(concat!("../", $op, "/", $variant, ".wgsl")),
                         tile: $variant_tile,
                         requires: &[$(Requirement::$requires),*],
                     },)*
@@ -132,13 +111,13 @@ table! {
         (x: f32, affine: f32) -> (y: f32, stats: f32),
         or "forward_vec4" tile FLAT, when [FeaturesMultipleOf4],
         or "forward_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups],
-        or "forward_short" as "forward_subgroup" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "forward_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Gradient to `x`: with `e = gamma · d_y` where `y > 0`, else 0: `d_x = rstd (e - mean(e) - x̂ mean(e x̂))`. Extent: rows.
     LAYER_NORM_RELU_BACKWARD_INPUT = "layer_norm_relu"/"backward_input", LayerNormParams, tile FLAT,
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (d_x: f32),
         or "backward_input_vec4" tile FLAT, when [FeaturesMultipleOf4],
         or "backward_input_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups],
-        or "backward_input_short" as "backward_input_subgroup" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "backward_input_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Sums of `d_y x̂` and `d_y` (where `y > 0`) over the rows of each chunk: `partial [chunks, 2, features]`. Extent: features × chunks.
     LAYER_NORM_RELU_BACKWARD_AFFINE = "layer_norm_relu"/"backward_affine", LayerNormParams, tile [64, 1, 1],
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32),
@@ -150,12 +129,12 @@ table! {
     POINT_LAYER_FORWARD = "point_layer"/"forward", PointLayerParams, tile FLAT,
         (x: f32, weights: f32, slots: u32, affine: f32) -> (y: f32),
         or "forward_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups],
-        or "forward_short" as "forward_subgroup" tile [32, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "forward_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// `d_x (+)= Wᵀ d_z`, `d_z` as the gradient of `layer_norm_relu`. Extent: rows of a group × 1 × groups.
     POINT_LAYER_BACKWARD_INPUT = "point_layer"/"backward_input", PointLayerParams, tile FLAT,
         (x: f32, weights: f32, slots: u32, affine: f32, d_y: f32) -> (d_x: f32),
         or "backward_input_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups],
-        or "backward_input_short" as "backward_input_subgroup" tile [32, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "backward_input_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
     /// Gates in the order i, f, g, o: `c = σ(f) c_prev + σ(i) tanh(g)`, `h = σ(o) tanh(c)`.
     /// `gates [rows, 4·hidden]` before activation, `c_prev [rows, hidden]` → `h, c [rows, hidden]`. Extent: rows · hidden.
     LSTM_CELL_FORWARD = "lstm_cell"/"forward", LstmParams, tile FLAT,

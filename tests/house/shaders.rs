@@ -11,7 +11,7 @@ use std::path::Path;
 fn modules() -> impl Iterator<Item = (String, &'static Kernel, &'static Variant, Module)> {
     TABLE.iter().flat_map(|kernel| {
         kernel.variants.iter().map(move |variant| {
-            let label = format!("{}/{}.wgsl", kernel.op, variant.file);
+            let label = format!("{}/{}.wgsl", kernel.op, variant.name);
             let source = source(kernel, variant, 16);
             let module = naga::front::wgsl::parse_str(&source)
                 .unwrap_or_else(|error| panic!("{label}: {}", error.emit_to_string(&source)));

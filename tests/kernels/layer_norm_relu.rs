@@ -27,7 +27,16 @@ pub static FORWARD: KernelTest = KernelTest {
         ("forward_subgroup", "b + b.zwxy, per_row > 2u", "b + b.zwxy, per_row > 4u"),
         ("forward_subgroup", "subgroupShuffleXor(a, 4u)", "subgroupShuffleXor(a, 2u)"),
         ("forward_subgroup", "pick(rstd, lane % 8u * per_row)", "pick(rstd, lane % 8u)"),
-        ("forward_short", "share * (4u * (workgroup", "share * (3u * (workgroup"),
+        ("forward_short", "+ 1e-5", "+ 1e-2"),
+        ("forward_short", "params.centred == 0u", "true"),
+        ("forward_short", "max(value, vec4(0.0))", "value"),
+        ("forward_short", "column < params.features / 4u);", "true);"),
+        ("forward_short", "4u, params.features > 128u", "2u, params.features > 128u"),
+        ("forward_short", "subgroupShuffleXor(sum, 4u)", "subgroupShuffleXor(sum, 2u)"),
+        ("forward_short", "index / 8u / teams * teams", "index / 8u"),
+        ("forward_short", "n * min(row + 2u, last)", "n * min(row + 1u, last)"),
+        ("forward_short", "rstd[member]", "rstd.x"),
+        ("forward_short", "4u * turns * (sharers", "3u * turns * (sharers"),
     ],
 };
 
@@ -52,7 +61,14 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
         ("backward_input_subgroup", "octet + 5u / per_row", "octet"),
         ("backward_input_subgroup", "subgroupShuffleXor(b, 1u)", "subgroupShuffleXor(b, 4u)"),
         ("backward_input_subgroup", "dot(e6, x6)", "dot(e6, e6)"),
-        ("backward_input_short", "share * (4u * (workgroup", "share * (3u * (workgroup"),
+        ("backward_input_short", "params.centred == 0u", "true"),
+        ("backward_input_short", "mean.y - c1", "mean.x - c1"),
+        ("backward_input_short", "passes & vec4(column < params.features / 4u)", "passes"),
+        ("backward_input_short", "4u, params.features > 128u", "2u, params.features > 128u"),
+        ("backward_input_short", "of_teams[first + 2u] +", "of_teams[first] +"),
+        ("backward_input_short", "dot(e_d3, d3)", "dot(e_d3, e_d3)"),
+        ("backward_input_short", "subgroupShuffleXor(sum, 1u)", "subgroupShuffleXor(sum, 4u)"),
+        ("backward_input_short", "4u * turns * (sharers", "3u * turns * (sharers"),
     ],
 };
 
