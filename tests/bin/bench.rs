@@ -1,7 +1,7 @@
-//! `bench [--quick] [--json] [--write]`: what a pose step, a training step and a picture cost on every executor, beside the rate
-//! that the matrix library reaches in the same run, and beside PyTorch where `python3` (or the interpreter that `PYTHON` names) has it.
-//! All that is compared takes turns, so that a busy minute of the machine meets all alike. `--write` puts the tables into
-//! `docs/performance.md`.
+//! `bench [--quick] [--gpu] [--width 64|256] [--json] [--write]`: what a pose step, a training step and a picture cost on every executor, beside
+//! the rate that the matrix library reaches in the same run, and beside PyTorch where `python3` (or the interpreter that `PYTHON` names) has it.
+//! All that is compared takes turns, so that a busy minute of the machine meets all alike. `--gpu`: only there, ours and PyTorch's; `--width`: only
+//! the nets of that width. `--write` puts the tables into `docs/performance.md`.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -17,7 +17,7 @@ use srn_gpu::KernelTime;
 use srn_tests::between;
 use srn_tests::peer::Peer;
 
-const USAGE: &str = "usage: bench [--quick] [--json] [--write]";
+const USAGE: &str = "usage: bench [--quick] [--gpu] [--width 64|256] [--json] [--write]";
 const SIDE: u32 = 64;
 const RAYS: u32 = SIDE * SIDE;
 /// Hypotheses of a pose step, as in the paper's measurement.
@@ -35,6 +35,8 @@ const LONG: f64 = 30.0;
 /// Seconds of a turn, at least: a shorter work is done over and over, as a search does its steps. A step of a few milliseconds between others would find
 /// none of its numbers in the cache.
 const LEAST: f64 = 0.2;
+/// Steps on a real GPU before their losses are read, as in a search, which reads at the end of a phase: while it does some, the CPU makes the next ready.
+const UNREAD: u32 = 8;
 /// Hypotheses and side of the image, from one to the other end of what is asked for.
 const SCALING: [(u32, u32); 8] = [(5, 16), (5, 32), (5, 64), (5, 128), (1, 32), (5, 32), (24, 32), (120, 32)];
 
@@ -126,25 +128,36 @@ fn main() -> ExitCode {
 
 fn run() -> Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    if let Some(other) = arguments.iter().find(|argument| !["--quick", "--json", "--write"].contains(&argument.as_str())) {
-        return Err(format!("{USAGE}, not {other}").into());
-    }
     let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
-    let quick = has("--quick");
+    let (quick, only_gpu) = (has("--quick"), has("--gpu"));
+    let mut widths = if quick { vec![64] } else { vec![64, 256] };
+    let mut rest = arguments.iter().map(String::as_str);
+    while let Some(argument) = rest.next() {
+        match argument {
+            "--quick" | "--gpu" | "--json" | "--write" => {}
+            "--width" => match rest.next() {
+                Some("64") => widths = vec![64],
+                Some("256") => widths = vec![256],
+                other => return Err(format!("{USAGE}, not --width {}", other.unwrap_or_default()).into()),
+            },
+            other => return Err(format!("{USAGE}, not {other}").into()),
+        }
+    }
 
-    let mut engines = vec![Engine::cpu()];
+    let mut engines = if only_gpu { vec![] } else { vec![Engine::cpu()] };
     match Gpu::open(None) {
         Ok(gpu) => engines.push(Engine::gpu(gpu)),
+        Err(error) if only_gpu => return Err(error.into()),
         Err(error) => eprintln!("only the CPU executor: {error}"),
     }
     let mut report = Report { hardware: hardware(&engines), ..Report::default() };
     eprintln!("{}", report.hardware);
     let [many_turns, turns] = if quick { [1, 1] } else { [MANY_TURNS, TURNS] };
     // The small nets first: the kernels of the large ones are compiled then.
-    for width in if quick { vec![64] } else { vec![64, 256] } {
+    for width in widths {
         let model = model(width)?;
         let benches: Vec<_> = engines.iter().map(|engine| Bench { engine, model: &model }).collect();
-        let peers: Vec<_> = Peer::start(width)?.into_iter().map(RefCell::new).collect();
+        let peers: Vec<_> = Peer::start(width, only_gpu, UNREAD)?.into_iter().map(RefCell::new).collect();
         report.peers_on = peers.iter().map(|peer| peer.borrow().runs_on.clone()).collect();
 
         let mut works = Vec::new();
@@ -365,15 +378,24 @@ impl Bench<'_> {
         if self.is_gpu() { "gpu" } else { "cpu" }
     }
 
-    fn work(&self, work: &str, flops: u64, bytes: u64, mut once: impl FnMut() -> Result<()> + 'static) -> Work {
+    /// What `once` does, taking so many steps.
+    fn work(&self, work: &str, flops: u64, bytes: u64, steps: u32, mut once: impl FnMut() -> Result<()> + 'static) -> Work {
         let (width, executor, budget) = (self.model.layout.features(), self.name(), self.engine.budget());
         let row = Row { work: work.into(), width, executor, seconds: 0.0, flops, of_sgemm: 0.0, bytes, budget };
         let once = Box::new(move || {
             let begin = Instant::now();
             once()?;
-            Ok(begin.elapsed().as_secs_f64())
+            Ok(begin.elapsed().as_secs_f64() / f64::from(steps))
         });
         Work { row, once }
+    }
+
+    /// Steps before losses are read. What a CPU does it cannot make ready meanwhile, and what stays on the host waits for it anyway.
+    fn unread(&self) -> u32 {
+        match self.engine.as_gpu() {
+            Some(gpu) if !gpu.adapter().is_software && self.engine.budget() > SMALL_BUDGET => UNREAD,
+            _ => 1,
+        }
     }
 
     fn descent(&self, method: Method, hypotheses: u32, side: u32) -> Result<Descent> {
@@ -391,9 +413,12 @@ impl Bench<'_> {
         let name = if matches!(method, Method::Adam { .. }) { "Adam" } else { "BFGS" };
         let mut descent = self.descent(method, hypotheses, side)?;
         let (work, flops) = (format!("pose step, {name}, {hypotheses} hypotheses"), descent.flops_per_step());
-        Ok(self.work(&work, flops, descent.bytes(), move || {
-            descent.evaluate()?;
-            descent.descend()?;
+        let steps = self.unread();
+        Ok(self.work(&work, flops, descent.bytes(), steps, move || {
+            for _ in 0..steps {
+                descent.evaluate()?;
+                descent.descend()?;
+            }
             descent.losses()?;
             Ok(())
         }))
@@ -432,8 +457,11 @@ impl Bench<'_> {
         let plan = trainer.executor().plan();
         let flops = plan.stages.iter().flat_map(|stage| &stage.steps).map(|step| step.flops).sum();
         let bytes = plan.bytes();
-        Ok(self.work("training step, 10 images", flops, bytes, move || {
-            trainer.step(&batch, 1e-4)?;
+        let steps = self.unread();
+        Ok(self.work("training step, 10 images", flops, bytes, steps, move || {
+            for _ in 0..steps {
+                trainer.step(&batch, 1e-4)?;
+            }
             trainer.losses()?;
             Ok(())
         }))
@@ -443,7 +471,7 @@ impl Bench<'_> {
         let mut renderer = Renderer::new(self.engine, self.model, 1, SIDE, SIDE)?;
         let cameras = [(camera::fixed24(1.3)[3], intrinsics(SIDE))];
         // A fifth of a pose step is one picture forward and backward; only its time is reported.
-        Ok(self.work("picture", 0, 0, move || {
+        Ok(self.work("picture", 0, 0, 1, move || {
             renderer.render(&[0], &cameras, 0)?;
             Ok(())
         }))

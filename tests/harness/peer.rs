@@ -28,22 +28,24 @@ pub struct Peer {
 }
 
 impl Peer {
-    /// One for each device that PyTorch has here, with the interpreter that `PYTHON` names, else `python3`; none where that has no PyTorch.
-    pub fn start(width: u32) -> Result<Vec<Self>, Box<dyn Error>> {
+    /// One for each device that PyTorch has here, or for its GPU alone, with the interpreter that `PYTHON` names, else `python3`; none where that has no
+    /// PyTorch. `unread`: steps on a GPU before their losses are read.
+    pub fn start(width: u32, only_gpu: bool, unread: u32) -> Result<Vec<Self>, Box<dyn Error>> {
         let python = std::env::var("PYTHON").unwrap_or("python3".into());
         let code = "import torch; print(torch.cuda.is_available())";
         let output = match Command::new(&python).args(["-c", code]).stderr(Stdio::null()).output() {
             Ok(output) if output.status.success() => output,
             _ => return Ok(Vec::new()),
         };
-        let devices: &[_] = if String::from_utf8_lossy(&output.stdout).trim() == "True" { &["cpu", "cuda"] } else { &["cpu"] };
-        devices.iter().map(|device| Self::on(&python, device, width)).collect()
+        let has_gpu = String::from_utf8_lossy(&output.stdout).trim() == "True";
+        let devices = [("cpu", 1, !only_gpu), ("cuda", unread, has_gpu)].into_iter().filter(|&(_, _, wanted)| wanted);
+        devices.map(|(device, unread, _)| Self::on(&python, device, width, unread)).collect()
     }
 
-    fn on(python: &str, device: &'static str, width: u32) -> Result<Self, Box<dyn Error>> {
+    fn on(python: &str, device: &'static str, width: u32, unread: u32) -> Result<Self, Box<dyn Error>> {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../bench/peer.py");
         let mut command = Command::new(python);
-        command.arg(script).args(["serve", "--width", &width.to_string(), "--device", device]);
+        command.arg(script).args(["serve", "--width", &width.to_string(), "--device", device, "--unread", &unread.to_string()]);
         let mut process = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
         let (questions, answers) = (process.stdin.take(), process.stdout.take().expect("it is piped"));
         let (runs_on, steps) = (String::new(), Vec::new());
