@@ -1,17 +1,15 @@
-//! What the binaries share: choice of the executor, exit codes, data sets as the network takes them, progress.
+//! What the binaries share: choice of the executor, exit codes, data sets as the network takes them.
 
 use std::error::Error;
 use std::fs::{File, TryLockError};
-use std::io::IsTerminal;
+use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Duration;
 
 use clap::builder::NonEmptyStringValueParser;
 use clap::{Arg, Args, Parser, ValueEnum};
 use glam::DMat4;
 use image::{ImageFormat, Rgb, RgbImage};
-use indicatif::{HumanDuration, ProgressBar, ProgressState, ProgressStyle};
 use sigma_srn::{Engine, Gpu, Intrinsics, Model, write_atomically};
 use srn_data::camera::Axes;
 use srn_data::{Dataset, LoadedView, SrnSet, sheet};
@@ -99,7 +97,7 @@ fn log(verbose: bool) {
     let level = if verbose { LevelFilter::DEBUG } else { LevelFilter::WARN };
     let ours = ["sigma", "srn"].map(|prefix| (prefix, level));
     let filter = Targets::new().with_default(LevelFilter::WARN).with_targets(ours);
-    let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal());
+    let lines = tracing_subscriber::fmt::layer().with_writer(io::stderr).with_ansi(io::stderr().is_terminal());
     // A second call in one process keeps the first one's setting.
     tracing_subscriber::registry().with(lines).with(filter).try_init().ok();
 }
@@ -196,7 +194,7 @@ pub fn create_dir(path: &Path) -> Result<()> {
 }
 
 /// Permissions say little of who may write where; a file does.
-fn try_to_write(folder: &Path) -> std::io::Result<()> {
+fn try_to_write(folder: &Path) -> io::Result<()> {
     let probe = folder.join(format!(".sigma-srn-{}", std::process::id()));
     File::create(&probe).and_then(|_| std::fs::remove_file(&probe))
 }
@@ -214,7 +212,7 @@ pub fn lock(path: &Path, busy: &str) -> Result<File> {
 /// Prints a result on stdout; a full disk or a closed pipe is an error, not a panic.
 pub fn print(text: &str) -> Result<()> {
     use std::io::Write;
-    writeln!(std::io::stdout(), "{text}").map_err(|error| format!("stdout: {error}").into())
+    writeln!(io::stdout(), "{text}").map_err(|error| format!("stdout: {error}").into())
 }
 
 /// A path as text, also one that is no UTF-8.
@@ -225,7 +223,7 @@ pub fn lossy<S: serde::Serializer>(path: &impl AsRef<Path>, serializer: S) -> st
 /// Writes a picture in the format that its ending names, else as PNG; whole or not at all.
 pub fn write_picture(path: &Path, picture: &RgbImage) -> Result<()> {
     let format = ImageFormat::from_path(path).unwrap_or(ImageFormat::Png);
-    let mut bytes = std::io::Cursor::new(Vec::new());
+    let mut bytes = io::Cursor::new(Vec::new());
     picture.write_to(&mut bytes, format).map_err(|error| format!("{}: {error}", path.display()))?;
     Ok(write_atomically(path, bytes.get_ref())?)
 }
@@ -253,32 +251,6 @@ pub fn depth_picture(depth: &[f32], side: u32, distance: f64) -> RgbImage {
 pub fn psnr(rendered: &[f32], target: &[f32]) -> f64 {
     let squares = rendered.iter().zip(target).map(|(r, t)| f64::from(r.clamp(-1.0, 1.0) - t).powi(2));
     10.0 * (4.0 * target.len() as f64 / squares.sum::<f64>()).log10()
-}
-
-/// A bar on stderr, with position, message and time left; nothing where stderr is not a terminal.
-pub fn progress(len: u64, what: &str) -> ProgressBar {
-    let template = format!("{what} {{bar:24}} {{pos}}/{{len}} {{msg}} {{left}}");
-    let style = ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
-    // Before the first is done nothing is known of it.
-    let left = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
-        let _ = if state.pos() > 0 { write!(out, "{} left", HumanDuration(state.eta())) } else { write!(out, "") };
-    };
-    let style = style.with_key("left", left);
-    let bar = ProgressBar::new(len).with_style(style);
-    bar.enable_steady_tick(Duration::from_millis(500));
-    bar
-}
-
-/// A bar on stderr that counts bytes; without a length, a counter that turns.
-pub fn bytes_progress(len: Option<u64>, what: &str) -> ProgressBar {
-    let template = match len {
-        Some(_) => format!("{what} {{bar:24}} {{bytes}}/{{total_bytes}} {{eta}} left"),
-        None => format!("{what} {{spinner}} {{bytes}}"),
-    };
-    let style = ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
-    let bar = len.map_or_else(ProgressBar::new_spinner, ProgressBar::new).with_style(style);
-    bar.enable_steady_tick(Duration::from_millis(200));
-    bar
 }
 
 #[cfg(test)]

@@ -15,8 +15,9 @@ use srn_data::inspect::{self, Origin};
 use srn_data::srn;
 use srn_data::target::MARGIN;
 
-use crate::common::{Result, axes, named, print, progress, refuse_existing, refuse_to_write, write_picture};
+use crate::common::{Result, axes, named, print, refuse_existing, refuse_to_write, write_picture};
 use crate::meshes;
+use crate::progress;
 
 /// Flags that say what a source is, and how it differs from what its format promises.
 #[derive(Args, Debug)]
@@ -189,7 +190,7 @@ impl Import {
         {
             return Err(format!("{}: --hold-out {n} takes {n} usable views or more, not {}", few.name, few.frames.len()).into());
         }
-        let bar = progress(captures.len() as u64, "objects");
+        let bar = progress::bar(captures.len() as u64, "objects");
         for capture in &mut captures {
             bar.set_message(capture.name.clone());
             let (placed, found_by) = if keep { (DMat4::IDENTITY, "kept as it was".into()) } else { self.place(format, capture)? };

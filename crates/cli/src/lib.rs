@@ -4,6 +4,7 @@ pub mod common;
 pub mod data;
 mod meshes;
 pub mod pose;
+mod progress;
 pub mod render;
 pub mod sets;
 pub mod train;

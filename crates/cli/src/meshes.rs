@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use srn_data::mesh::{self, Mesh};
 
-use crate::common::{Result, print, progress};
+use crate::common::{Result, print};
+use crate::progress;
 
 #[derive(Serialize)]
 struct Report {
@@ -53,7 +54,7 @@ pub fn inspect(paths: &[PathBuf], json: bool) -> Result<bool> {
     if !json {
         print(&format!("{:>9} {:>5} {:>8} {:>30} {:>8}  file", "triangles", "parts", "textures", "size", "warnings"))?;
     }
-    let bar = progress(files.len() as u64, "meshes");
+    let bar = progress::bar(files.len() as u64, "meshes");
     for path in files {
         bar.set_message(path.file_name().unwrap_or_default().to_string_lossy().into_owned());
         let found = match mesh::load(&path) {

@@ -13,7 +13,8 @@ use srn_data::srn::{InstanceWriter, Intrinsics};
 use srn_data::{camera, ldraw, sheet};
 use srn_gpu::raster::{self, Rasterizer};
 
-use crate::common::{Result, print, progress, refuse_existing};
+use crate::common::{Result, print, refuse_existing};
+use crate::progress;
 use crate::sets::{Cache, Set};
 
 /// Flags of `sigma-data render`.
@@ -258,7 +259,7 @@ impl Render {
         let gpu = srn_gpu::Gpu::open(self.adapter.as_deref())?;
         eprintln!("adapter: {}", gpu.adapter());
         let rasterizer = Rasterizer::new(&gpu)?;
-        Ok(Studio { args: self, rasterizer, radius, intrinsics, bar: progress(pictures as u64, "pictures") })
+        Ok(Studio { args: self, rasterizer, radius, intrinsics, bar: progress::bar(pictures as u64, "pictures") })
     }
 }
 

@@ -15,7 +15,8 @@ use super::notation::Notation;
 use super::search::{self, On, PoseError, SearchArgs, Starts, render};
 use super::symmetry::Symmetries;
 use super::views::{self, Views, spread};
-use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_to_write};
+use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
+use crate::progress;
 use crate::train::adapt::Fit;
 
 /// Where no search failed: the limits of what is unexplained, over the most that was.
@@ -186,7 +187,7 @@ struct AtTruth(BTreeMap<String, BTreeMap<String, f64>>);
 
 impl AtTruth {
     fn of(on: On, all: &[Views]) -> Result<Self> {
-        let bar = progress(all.len() as u64, "instances");
+        let bar = progress::bar(all.len() as u64, "instances");
         let mut at_truth = BTreeMap::new();
         for Views { name, pictures, truths, .. } in all {
             let true_views: Vec<View> =
@@ -260,7 +261,7 @@ impl Searches {
         let known = asked.iter().zip(&symmetries).zip(&found).flat_map(|(views, found)| known_of(views, found)).collect();
 
         let options = Options { min_starts: 0, ..Options::of(Effort::Fast) };
-        let bar = progress(asked.len() as u64, "wrong poses");
+        let bar = progress::bar(asked.len() as u64, "wrong poses");
         let mut lost = Vec::new();
         for (views, symmetries) in asked.iter().zip(&symmetries) {
             let far = |(picture, truth): (&Picture, &DMat4)| -> Result<Vec<DMat4>> {

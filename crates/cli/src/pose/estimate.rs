@@ -16,9 +16,8 @@ use super::notation::{Notation, NotationArgs, ObjectPose};
 use super::outline;
 use super::record::Log;
 use super::search::{On, PoseError, SearchArgs, Starts, deviation, run as search, within_95};
-use crate::common::{
-    EngineArgs, Result, about_model, create_dir, load_model, lossy, print, progress, refuse_existing, refuse_to_write,
-};
+use crate::common::{EngineArgs, Result, about_model, create_dir, load_model, lossy, print, refuse_existing, refuse_to_write};
+use crate::progress;
 
 /// Pictures that are searched for side by side, enough to fill a large GPU. What was found of them is printed before the next ones are looked at.
 const AT_ONCE: usize = 32;
@@ -196,7 +195,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
 fn searched(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
     let &mut Output { args, on, pictures, .. } = output;
     let settings = args.search.search()?;
-    let bar = progress(0, "steps");
+    let bar = progress::bar(0, "steps");
     let (mut left, mut before) = (pictures.len().div_ceil(AT_ONCE) as u64, 0);
     for (pictures, starts) in pictures.chunks(AT_ONCE).zip(starts.chunks(AT_ONCE)) {
         let (first, mut log) = (output.images.len(), Log::default());
@@ -234,7 +233,7 @@ fn searched(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
 /// Poses of objects that are not in the model.
 fn unseen(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
     let &mut Output { args, on, pictures, .. } = output;
-    let bar = progress(0, "turns");
+    let bar = progress::bar(0, "turns");
     for (number, (picture, starts)) in pictures.iter().zip(starts).enumerate() {
         let observe = |turn: usize, turns: usize| {
             bar.set_length((turns * pictures.len()) as u64);

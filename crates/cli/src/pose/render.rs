@@ -15,7 +15,8 @@ use super::files::{CameraArgs, instance_of, write_gif};
 use super::notation::NotationArgs;
 use super::search::{On, render};
 use super::{draw, positive};
-use crate::common::{EngineArgs, Result, load_model, print, progress, refuse_existing, refuse_to_write, write_picture};
+use crate::common::{EngineArgs, Result, load_model, print, refuse_existing, refuse_to_write, write_picture};
+use crate::progress;
 
 /// Side of a view where neither the flags nor the model say it, pixels.
 const SIDE: u32 = 64;
@@ -114,7 +115,7 @@ pub fn run(args: &Render) -> Result<bool> {
             false => rgb8(&view.rgb, side as usize, side as usize),
         }
     };
-    let bar = progress(views.len() as u64, "views");
+    let bar = progress::bar(views.len() as u64, "views");
     let mut pictures: Vec<RgbImage> = vec![];
     for (views, poses) in views.chunks(AT_ONCE).zip(poses.chunks(AT_ONCE)) {
         pictures.extend(render(On { engine: &engine, model: &model, side }, views)?.iter().zip(poses).map(draw));

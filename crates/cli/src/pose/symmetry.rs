@@ -9,7 +9,8 @@ use sigma_srn::{Intrinsics, View};
 
 use super::search::{On, render};
 use super::views::Views;
-use crate::common::{Result, progress};
+use crate::common::Result;
+use crate::progress;
 
 /// Views that are compared.
 const VIEWS: usize = 12;
@@ -57,7 +58,7 @@ impl Symmetries {
         let plain = seen(DMat4::IDENTITY)?;
         let object = sum(&mut plain.iter().map(|value| value - 1.0));
         let mut turns = Vec::new();
-        let bar = progress(3 * TURNS.len() as u64, "symmetries");
+        let bar = progress::bar(3 * TURNS.len() as u64, "symmetries");
         for axis in 0..3 {
             for degrees in TURNS {
                 let turned = seen(DMat4::from_mat3(turn(axis, f64::from(degrees).to_radians())))?;

@@ -16,7 +16,8 @@ use super::search::{LOSSES, On, PoseError, Preset, SearchArgs, Starts};
 use super::summary::{Statistics, Summary, markdown};
 use super::symmetry::Symmetries;
 use super::views::{self, Views};
-use crate::common::{Result, create_dir, load_model, progress, refuse_existing, write_picture};
+use crate::common::{Result, create_dir, load_model, refuse_existing, write_picture};
+use crate::progress;
 use crate::train::adapt::Fit;
 
 /// Files that are written.
@@ -169,7 +170,7 @@ fn row(preset: &str, setting: &Setting, views: &[&ViewReport]) -> Vec<String> {
 
 /// Searches for views of objects that the model does not know, each for itself.
 fn one_shot(on: On, asked: &[Views], search: &SearchArgs, starts: &Starts) -> Result<Vec<Vec<Found>>> {
-    let bar = progress(asked.iter().map(|views| views.pictures.len() as u64).sum(), "views");
+    let bar = progress::bar(asked.iter().map(|views| views.pictures.len() as u64).sum(), "views");
     let mut all = Vec::new();
     for Views { name, pictures, truths, .. } in asked {
         bar.set_message(name.clone());

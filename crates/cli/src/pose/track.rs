@@ -15,7 +15,8 @@ use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side
 use super::mask::MadeRight;
 use super::notation::{NotationArgs, ObjectPose};
 use super::search::{PoseError, SearchArgs, Starts, deviation, query, with_cooperative_said};
-use crate::common::{EngineArgs, Result, load_model, lossy, print, progress, refuse_to_write};
+use crate::common::{EngineArgs, Result, load_model, lossy, print, refuse_to_write};
+use crate::progress;
 
 /// Side of a frame in the animation, pixels.
 const SHOWN: u32 = 192;
@@ -162,7 +163,7 @@ pub fn run(args: &Track) -> Result<bool> {
         let observe = |seen: Progress| {
             // Most frames are done before anyone wonders.
             if began.elapsed() > PATIENCE {
-                let bar = bar.get_or_insert_with(|| progress(0, "steps"));
+                let bar = bar.get_or_insert_with(|| progress::bar(0, "steps"));
                 bar.set_length(seen.steps.into());
                 bar.set_position(seen.step.into());
             }

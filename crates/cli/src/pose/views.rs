@@ -10,7 +10,8 @@ use srn_data::srn::SrnSet;
 use super::files::{Picture, model_side};
 use super::notation::Notation;
 use super::search::{On, SearchArgs, Starts, run};
-use crate::common::{Result, camera, progress};
+use crate::common::{Result, camera};
+use crate::progress;
 
 /// Views of one instance.
 pub struct Views {
@@ -72,7 +73,7 @@ pub fn search(
     }
     // Views of data sets have no masks to be made right.
     let steps: u64 = search.tries[0].phases.iter().filter(|phase| !phase.outlines).map(|phase| u64::from(phase.steps)).sum();
-    let bar = progress(steps * asked.len() as u64, "steps");
+    let bar = progress::bar(steps * asked.len() as u64, "steps");
     let mut found = Vec::new();
     for (i, (Views { name, pictures, .. }, starts)) in asked.iter().zip(&all_starts).enumerate() {
         bar.set_message(name.clone());

@@ -11,7 +11,8 @@ use indicatif::ProgressBar;
 use sha2::{Digest, Sha256};
 
 use super::{Client, Package, Set, archive};
-use crate::common::{Result, bytes_progress, lock, print};
+use crate::common::{Result, lock, print};
+use crate::progress;
 
 /// Flags of `sigma-data fetch`.
 #[derive(Args, Debug)]
@@ -115,7 +116,7 @@ impl Cache {
         let incoming = suffixed(folder, ".incoming");
         make_folder(&incoming)?;
         let name = package.name;
-        let bar = bytes_progress(Some(release.bytes), &format!("downloading {name}"));
+        let bar = progress::bytes(Some(release.bytes), &format!("downloading {name}"));
         let (program, ending, arguments, sign): (_, _, &[&str], _) = match package.client {
             Client::Apt => ("apt-get", "deb", &["download"], "="),
             // What npm's own cache has will do, since the sum is checked. By default it tries for minutes where there is no network.
@@ -204,7 +205,7 @@ impl Package {
             Ok(path) => keep(path, content),
             Err(_) => keep(Path::new("copyright"), content),
         };
-        let bar = bytes_progress(None, &format!("unpacking {}", self.name));
+        let bar = progress::bytes(None, &format!("unpacking {}", self.name));
         let file = File::open(archive).map_err(|error| about(archive, error))?;
         let unpacked = match self.client {
             Client::Npm => archive::tar(flate2::read::GzDecoder::new(bar.wrap_read(file)), &wanted, &mut keep_all),
@@ -243,7 +244,7 @@ fn releases(text: &str) -> Vec<Release> {
 /// Refuses a file with another sum, and removes it: the next fetch begins anew.
 fn verify(file: &Path, expected: &str) -> Result<()> {
     let length = fs::metadata(file).map_err(|error| about(file, error))?.len();
-    let bar = bytes_progress(Some(length), "verifying");
+    let bar = progress::bytes(Some(length), "verifying");
     let mut content = bar.wrap_read(File::open(file).map_err(|error| about(file, error))?);
     let mut sum = Sha256::new();
     let mut buffer = vec![0; 1 << 20];

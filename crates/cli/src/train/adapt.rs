@@ -15,6 +15,7 @@ use super::reflection::{self, Reflection};
 use super::settings::{positive, up_to};
 use super::{Shown, psnr_of_each, render, training_batch};
 use crate::common::{self, EngineArgs, Result, print};
+use crate::progress;
 
 /// Unseen views of an instance that are looked at in the end, at most.
 const UNSEEN: usize = 8;
@@ -118,7 +119,7 @@ impl Fit {
         views: &[Shown],
         side: u32,
     ) -> Result<(Model, Vec<Vec<Reflection>>)> {
-        let bar = common::progress(self.steps + self.network_steps, "fitting");
+        let bar = progress::bar(self.steps + self.network_steps, "fitting");
         let [rays, network_rays] = [self.rays, self.network_rays].map(|rays| rays.min(side * side));
         let has_two_views = views.len() >= 2 * names.len();
         let model = trained.with_new_instances(names.clone())?;

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use image::RgbImage;
-use indicatif::{HumanDuration, ProgressBar};
+use indicatif::ProgressBar;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use sigma_srn::{Engine, Losses, Metadata, Model, Random, Renderer, Train, Trainer, stream, write_atomically};
@@ -22,11 +22,10 @@ use srn_data::{Dataset, SrnSet, pixels, sheet};
 
 use super::{Changeable, ForGood, Preset, Settings, Shown, psnr_of_each, render, training_batch};
 use crate::common::{self, EngineArgs, Result, load_model, print, write_picture};
+use crate::progress;
 
 /// Time between checkpoints.
 const CHECKPOINT_INTERVAL: Duration = Duration::from_secs(60);
-/// Time between lines of progress where stderr is no terminal.
-const LINE_INTERVAL: Duration = Duration::from_secs(30);
 /// Time after which the loss on the terminal is old.
 const STALE: Duration = Duration::from_secs(2);
 /// Radius of the ball around the object, object units.
@@ -385,35 +384,29 @@ impl Metrics {
     }
 }
 
-/// Progress on stderr: a bar, or a line now and then where stderr is no terminal.
+/// Progress on stderr.
 struct Meter {
     bar: ProgressBar,
-    steps: u64,
     rays_per_step: u64,
-    first_step: u64,
     start: Instant,
     seconds_before: f64,
     /// Step and time from which the speed is measured.
     since: (u64, Instant),
-    last_line: Option<Instant>,
     /// Mean of the image loss over about the last ten readings, and their number.
     image_loss: (f64, u32),
 }
 
 impl Meter {
     fn new(settings: &Settings, step: u64, seconds_before: f64) -> Self {
-        let bar = common::progress(settings.steps, "training").with_position(step);
+        let bar = progress::bar(settings.steps, "training").with_position(step);
         bar.reset_eta();
         let now = Instant::now();
         Meter {
             bar,
-            steps: settings.steps,
             rays_per_step: u64::from(settings.batch) * u64::from(settings.rays),
-            first_step: step,
             start: now,
             seconds_before,
             since: (step, now),
-            last_line: None,
             image_loss: (0.0, 0),
         }
     }
@@ -439,11 +432,6 @@ impl Meter {
         let psnr = Losses { image, ..*losses }.psnr();
         let validation = validation_psnr.map_or(String::new(), |psnr| format!(", validation {psnr:.2} dB"));
         let message = format!("loss {:.3}, PSNR {psnr:.2} dB{validation}, {rays_per_second:.0} rays/s", losses.total());
-        if self.bar.is_hidden() && (self.last_line.is_none_or(|at| at.elapsed() > LINE_INTERVAL) || step == self.steps) {
-            let left = self.start.elapsed().mul_f64((self.steps - step) as f64 / (step - self.first_step) as f64);
-            eprintln!("step {step}/{}: {message}, {} left", self.steps, HumanDuration(left));
-            self.last_line = Some(Instant::now());
-        }
         self.bar.set_message(message);
         self.since = (step, Instant::now());
     }
