@@ -122,6 +122,6 @@ mod tests {
         assert_eq!(drawn(&lines, "  "), None);
         assert_eq!(drawn(&lines, "views 1/9   "), Some("views 1/9".into()));
         assert_eq!(drawn(&lines, "views 2/9"), None);
-        assert_eq!(drawn(&Lines::new(FIRST_LINE), "views 1/9"), None);
+        assert_eq!(drawn(&Lines::new(NEXT_LINE), "views 1/9"), None);
     }
 }
