@@ -19,7 +19,7 @@ use crate::photo::{OUTSIDE, Photo, SIDE, Spoil, Spoiled, exposed};
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str = "usage: robustness [distance] [near] [light] [masks] [hidden] [others] [--seed N]";
+const USAGE: &str = "usage: robustness [distance] [near] [light] [masks] [alone] [hidden] [others] [--seed N]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -78,7 +78,7 @@ struct Table {
     rows: &'static [Row],
 }
 
-const TABLES: [Table; 6] = [
+const TABLES: [Table; 7] = [
     Table {
         name: "distance",
         searches: &[AROUND_FAST],
@@ -121,14 +121,18 @@ const TABLES: [Table; 6] = [
         ],
     },
     Table {
-        name: "hidden",
+        name: "alone",
         searches: &[AROUND, AROUND_FAST],
         rows: &[
-            row("object alone", Spoil::Alone),
-            row("3/10 hidden", Spoil::Bar(0.3)),
-            row("half hidden", Spoil::Bar(0.5)),
-            row("3/10 cut off", Spoil::Edge(0.3)),
+            row("the model's light", Spoil::Alone(|colour, _| colour)),
+            row("1 stop less", Spoil::Alone(|colour, _| exposed(colour, [0.5; 3]))),
+            row("1 stop more", Spoil::Alone(|colour, _| exposed(colour, [2.0; 3]))),
         ],
+    },
+    Table {
+        name: "hidden",
+        searches: &[AROUND, AROUND_FAST],
+        rows: &[row("3/10 hidden", Spoil::Bar(0.3)), row("half hidden", Spoil::Bar(0.5)), row("3/10 cut off", Spoil::Edge(0.3))],
     },
     Table {
         name: "others",

@@ -14,13 +14,16 @@ const TABLE: [f64; 3] = [115.0, 89.0, 64.0];
 const SHADOW: f64 = 0.45;
 const BAR: Rgb<u8> = Rgb([90, 96, 104]);
 
+/// What light makes of a colour in [0, 1] that is so far to the right, in [0, 1].
+pub type Lit = fn([f64; 3], f64) -> [f64; 3];
+
 /// What is wrong with a picture. Lengths are pixels of [`SIDE`].
 #[derive(Clone, Copy)]
 pub enum Spoil {
     /// Cut out exactly, in the light of the training.
     Nothing,
-    /// Other light: a colour in [0, 1], and how far to the right it is, in [0, 1].
-    Light(fn([f64; 3], f64) -> [f64; 3]),
+    /// Other light.
+    Light(Lit),
     /// The mask, so much too large.
     Larger(f64),
     /// The mask, off by this standard deviation at random, alike over 8.
@@ -33,8 +36,8 @@ pub enum Spoil {
     Missing(f64),
     /// This part of it missing in the mask, on one of four sides.
     Lacking(f64),
-    /// The segmentation says what counts; around the object there is anything.
-    Alone,
+    /// The segmentation says what counts; around the object there is anything. In other light.
+    Alone(Lit),
     /// A bar over this part of it, from one of four sides.
     Bar(f64),
     /// This part of it beyond the picture's edge, on one of four sides.
@@ -80,12 +83,7 @@ impl Photo {
         let (mut seen, mut mask, mut frame) = (self.object.clone(), None, [[0, SIDE]; 2]);
         match spoil {
             Spoil::Nothing | Spoil::Another(_) => {}
-            Spoil::Light(lit) => {
-                for (x, _, pixel) in self.picture.enumerate_pixels_mut() {
-                    let colour = lit(pixel.0.map(|v| f64::from(v) / 255.0), f64::from(x) / f64::from(SIDE));
-                    pixel.0 = colour.map(|v| (255.0 * v).round() as u8);
-                }
-            }
+            Spoil::Light(lit) => self.lit_by(lit),
             Spoil::Larger(by) => seen = self.moved(|_, _| by),
             Spoil::Ragged(by) => {
                 let noise = smooth_noise(8, random);
@@ -115,7 +113,10 @@ impl Photo {
                 let side = self.side(part, view);
                 fill(&mut seen, |x, y| [x, y].iter().zip(side).all(|(at, [first, end])| (first..end).contains(at)), OUTSIDE);
             }
-            Spoil::Alone => mask = Some(std::mem::replace(&mut seen, GrayImage::from_pixel(SIDE, SIDE, INSIDE))),
+            Spoil::Alone(lit) => {
+                self.lit_by(lit);
+                mask = Some(std::mem::replace(&mut seen, GrayImage::from_pixel(SIDE, SIDE, INSIDE)));
+            }
             Spoil::Bar(part) => {
                 let bar = self.side(part, view);
                 let is_bar = |x: u32, y: u32| [x, y].iter().zip(bar).all(|(at, [first, end])| (first..end).contains(at));
@@ -161,6 +162,13 @@ impl Photo {
         let mut side = [[0, SIDE]; 2];
         side[axis] = if is_last { [last + 1 - wide, SIDE] } else { [0, first + wide] };
         side
+    }
+
+    fn lit_by(&mut self, lit: Lit) {
+        for (x, _, pixel) in self.picture.enumerate_pixels_mut() {
+            let colour = lit(pixel.0.map(|v| f64::from(v) / 255.0), f64::from(x) / f64::from(SIDE));
+            pixel.0 = colour.map(|v| (255.0 * v).round() as u8);
+        }
     }
 
     /// The outline, so many pixels farther out.

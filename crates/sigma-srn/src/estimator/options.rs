@@ -20,7 +20,7 @@ pub struct Phase {
     /// `usize::MAX`: all. Of an object that is partly hidden twice as many, where rays are not cast at every pixel.
     pub keep: usize,
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`](crate::Query::coverage) is known: see [`Light`](crate::Light). From wrong
-    /// poses the light looks wrong, too.
+    /// poses the light looks wrong, too. In the phases before the first such one each hypothesis has a light of its own, if no outline is in sight: then colours are all there is.
     pub light: bool,
     /// Whether each hypothesis begins where it looks best: at its pose, turned from it by 15° about the object, to either side about each axis of the camera, or an eighth
     /// nearer or farther away. Of a sharp model a descent finds the way from less far than starts are apart.

@@ -63,18 +63,27 @@ impl Targets {
         (self.shape.width * self.shape.height) as usize
     }
 
-    /// Makes up for the light of the image of each query, where its coverage is known: that between it and the view from the best pose.
-    fn undo_lights(&mut self, queries: &[Query], stride: u32, running: &[Hypothesis], renders: &[f32]) -> Vec<Option<Light>> {
+    /// Makes up for the light of the image of each query of which `is_made_up` says so. Where the phase is in the model's light, that is the light between it and the
+    /// view from the best pose, which is returned; before, each hypothesis has its own.
+    fn undo_lights(
+        &mut self,
+        queries: &[Query],
+        phase: &Phase,
+        running: &[Hypothesis],
+        renders: &[f32],
+        is_made_up: impl Fn(&Query) -> bool,
+    ) -> Vec<Option<Light>> {
         let mut lights = vec![None; queries.len()];
         let values = 3 * self.rays_per_image();
         for ((hypothesis, render), rgb) in zip(running, renders.chunks(values)).zip(self.rgb.chunks_mut(values)) {
             let query = &queries[hypothesis.query];
-            if query.coverage.is_some() {
+            if is_made_up(query) {
                 let seen = query.seen(hypothesis.outline);
-                let coverage: Vec<f32> = query.pixels(stride).map(|pixel| seen.coverage[pixel]).collect();
-                let weights = || seen.ray_weights(query.pixels(stride));
+                let coverage: Vec<f32> = query.pixels(phase.stride).map(|pixel| seen.coverage[pixel]).collect();
+                let weights = || seen.ray_weights(query.pixels(phase.stride));
                 let between = || Light::between(rgb, render, &coverage, &weights(), query.has_outline());
-                lights[hypothesis.query].get_or_insert_with(between).undo(rgb, &coverage);
+                let light = if phase.light { *lights[hypothesis.query].get_or_insert_with(between) } else { between() };
+                light.undo(rgb, &coverage);
             }
         }
         lights
@@ -139,7 +148,10 @@ pub(super) fn prepare(
     let mut targets = Targets::new(queries, options, phase, running);
     let method = options.method.with_stride(phase.stride);
     let mut lights = vec![None; queries.len()];
-    let makes_up = phase.light && queries.iter().any(|query| query.coverage.is_some());
+    // Without an outline in sight colours are all there is: in another light no pose would look right before the last phases.
+    let ever = options.phases.iter().any(|phase| phase.light);
+    let is_made_up = |query: &Query| query.coverage.is_some() && (phase.light || ever && !query.has_outline());
+    let makes_up = queries.iter().any(is_made_up);
     // The paper's way compares whole images.
     let looks_closer = phase.steps > 0 && matches!(method, Method::Bfgs { .. });
     if makes_up || looks_closer {
@@ -147,11 +159,55 @@ pub(super) fn prepare(
         views.compare()?;
         let renders = views.rgb()?;
         if makes_up {
-            lights = targets.undo_lights(queries, phase.stride, running, &renders);
+            lights = targets.undo_lights(queries, phase, running, &renders, is_made_up);
         }
         if looks_closer {
             targets = targets.in_regions(&renders).unwrap_or(targets);
         }
     }
     Ok((targets.descent(engine, model, method, is_moving, running)?, lights))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::fixed24;
+    use crate::renderer::render_views;
+    use crate::{Effort, Intrinsics, ModelConfig, Outline};
+
+    /// In half the contrast, darker: losses of the pose that a picture was made from and of another one in a search's first look.
+    fn losses(options: &Options, coverage: Option<Vec<f32>>) -> Vec<f64> {
+        const SIDE: u32 = 32;
+        let model =
+            Model::init(&ModelConfig { hidden: 16, latent: 4, instances: 1, tracing_steps: 3, density: true }, 3).unwrap();
+        let engine = Engine::cpu();
+        let intrinsics = Intrinsics { fx: 36.0, fy: 36.0, cx: 16.0, cy: 16.0, pixel_center: 0.0 };
+        let starts = vec![fixed24(1.3)[5], fixed24(1.3)[16]];
+        let view = render_views(&engine, &model, [SIDE, SIDE], &[(0, starts[0], intrinsics)]).unwrap().remove(0).rgb;
+        let rgb = view.iter().map(|colour| 0.5 * colour - 0.2).collect();
+        let (width, height, outline) = (SIDE, SIDE, Outline::AS_GIVEN);
+        let query = Query { instance: 0, rgb, weights: None, coverage, outline, width, height, intrinsics, starts };
+        let hypothesis = |start: usize| Hypothesis::new(0, start, Pose6::from_matrix(&query.starts[start]), outline);
+        let running = [0, 1].map(hypothesis);
+        let (mut descent, lights) =
+            prepare(&engine, &model, &[query.clone()], options, &options.phases[0], false, &running).unwrap();
+        assert_eq!(lights, [None], "it is no light of the image yet");
+        descent.compare().unwrap();
+        descent.losses().unwrap()
+    }
+
+    #[test]
+    fn an_object_alone_is_compared_in_each_hypothesis_own_light() {
+        let options = Options::of(Effort::Fast);
+        let alone = || Some(vec![1.0; 32 * 32]);
+        let [dark, other] = losses(&options, None)[..] else { panic!() };
+        let [own, wrong] = losses(&options, alone())[..] else { panic!() };
+        assert!(3.0 * own < dark.min(wrong), "{dark} {other} {own} {wrong}");
+        // The paper's way knows no light.
+        let paper = Options::paper();
+        assert_eq!(losses(&paper, alone()), losses(&paper, None));
+        // An outline says where the object is: colours are taken as they are.
+        let cut: Vec<f32> = (0..32 * 32).map(|k| if k % 32 < 16 { 1.0 } else { 0.0 }).collect();
+        assert_eq!(losses(&options, Some(cut)), losses(&options, None));
+    }
 }
