@@ -190,7 +190,7 @@ mod tests {
         let hypothesis = |start: usize| Hypothesis::new(0, start, Pose6::from_matrix(&query.starts[start]), outline);
         let running = [0, 1].map(hypothesis);
         let (mut descent, lights) =
-            prepare(&engine, &model, &[query.clone()], options, &options.phases[0], false, &running).unwrap();
+            prepare(&engine, &model, std::slice::from_ref(&query), options, &options.phases[0], false, &running).unwrap();
         assert_eq!(lights, [None], "it is no light of the image yet");
         descent.compare().unwrap();
         descent.losses().unwrap()
