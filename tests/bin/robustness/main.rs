@@ -124,7 +124,7 @@ const TABLES: [Table; 7] = [
         name: "alone",
         searches: &[AROUND, AROUND_FAST],
         rows: &[
-            row("the model's light", Spoil::Alone(|colour, _| colour)),
+            row("the model's", Spoil::Alone(|colour, _| colour)),
             row("1 stop less", Spoil::Alone(|colour, _| exposed(colour, [0.5; 3]))),
             row("1 stop more", Spoil::Alone(|colour, _| exposed(colour, [2.0; 3]))),
         ],
