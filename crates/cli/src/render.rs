@@ -53,6 +53,9 @@ pub struct Render {
     /// training views are displaced.
     #[arg(long, default_value_t = 0.0, value_parser = jitter)]
     jitter: f64,
+    /// Turns each camera about its optical axis at random: pictures as a hand or a robot's arm takes them, to find poses in. A model needs none to learn from.
+    #[arg(long)]
+    roll: bool,
     /// Decides the random cameras, together with each instance's name.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -281,6 +284,7 @@ impl Studio<'_> {
                 Cameras::Spiral => camera::spiral(folder.views, self.radius),
             };
             let poses = if folder.jitter > 0.0 { camera::jittered(&poses, folder.jitter, seed) } else { poses };
+            let poses = if self.args.roll { camera::rolled(&poses, seed) } else { poses };
             for (i, pose) in poses.iter().enumerate() {
                 writer.add(&format!("{i:06}"), &self.picture(&model, pose)?, pose)?;
                 self.bar.inc(1);

@@ -196,6 +196,12 @@ pub fn jittered(cameras: &[DMat4], jitter: f64, seed: u64) -> Vec<DMat4> {
     cameras.iter().map(&mut displaced).collect()
 }
 
+/// The same cameras, each turned at random about its optical axis.
+pub fn rolled(cameras: &[DMat4], seed: u64) -> Vec<DMat4> {
+    let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
+    cameras.iter().map(|camera| *camera * DMat4::from_rotation_z(rng.random_range(0.0..TAU))).collect()
+}
+
 /// `n` cameras that look at the origin along the spherical spiral of the SRN test sets: from pole to pole in equal steps of the
 /// polar angle θ while the azimuth turns by `40·θ/π` radians. SRN walks only the upper half; here the whole sphere is walked,
 /// as the training cameras see it all. Steps are centred, so that no camera sits on a pole.
@@ -290,6 +296,19 @@ mod tests {
         }
         assert!((1.17..1.18).contains(&nearest) && (1.42..1.4301).contains(&furthest), "{nearest} to {furthest}");
         assert!((0.045..0.0501).contains(&most_off), "{most_off}");
+    }
+
+    #[test]
+    fn rolled_cameras_look_the_same_way_from_the_same_places() {
+        let cameras = uniform_sphere(100, 1.3, 7);
+        let mut quarters = [0; 4];
+        for (was, is) in cameras.iter().zip(rolled(&cameras, 2)) {
+            assert!(rigid_error(&is) < 1e-12 && was.w_axis == is.w_axis && (was.z_axis - is.z_axis).length() < 1e-12);
+            let turned = was.x_axis.truncate().cross(is.x_axis.truncate()).dot(was.z_axis.truncate());
+            let quarter = 2 * usize::from(turned > 0.0) + usize::from(was.x_axis.dot(is.x_axis) > 0.0);
+            quarters[quarter] += 1;
+        }
+        assert!(quarters.iter().all(|&count| count > 10), "{quarters:?}");
     }
 
     #[test]
