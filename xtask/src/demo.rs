@@ -35,10 +35,10 @@ pub fn run(arguments: &[String]) -> Result<(), String> {
         accept(evaluate.status())?;
     }
 
-    println!("\nOne search in pictures, from all around (around84):\n");
+    println!("\nOne search in pictures, from all around (around576):\n");
     let mut estimate = sigma_pose("estimate", model, "cpu");
     estimate.arg(format!("{VIEWS}/{SHOWN}.png"));
-    estimate.args(["--starts", "around84", "--truth", "auto", "--force", "--record", &format!("{OUT}/around84")]);
+    estimate.args(["--starts", "around576", "--truth", "auto", "--force", "--record", &format!("{OUT}/around576")]);
     accept(estimate.status())?;
 
     println!("\nThe pose found for {SHARED}, refined by both executors:\n");

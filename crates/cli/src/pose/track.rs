@@ -14,7 +14,7 @@ use super::draw;
 use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side, warn_of_turned};
 use super::mask::MadeRight;
 use super::notation::{NotationArgs, ObjectPose};
-use super::search::{PoseError, SearchArgs, Starts, deviation, query, with_cooperative_said};
+use super::search::{PoseError, SearchArgs, deviation, query, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, lossy, print, refuse_to_write};
 use crate::progress;
 
@@ -148,7 +148,7 @@ pub fn run(args: &Track) -> Result<bool> {
             truth => truth?,
         };
         followed = Some(picture.instance);
-        let starts = args.search.starts(&Starts::Around84, &model, &picture, side, None, &notation)?;
+        let starts = args.search.starts(&args.search.all_around(), &model, &picture, side, None, &notation)?;
         let tracker = match &mut tracker {
             Some(tracker) => tracker,
             none => {

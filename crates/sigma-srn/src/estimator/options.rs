@@ -17,7 +17,7 @@ pub struct Phase {
     pub stride: u32,
     /// How many hypotheses of each image enter this phase: those with the lowest loss, and of several that have come to the same pose the best
     /// alone. Where all of them look at the same side of the object, one more: the best of another side, unless its loss is more than twice that of the best.
-    /// `usize::MAX`: all. Of an object that is partly hidden twice as many, where rays are not cast at every pixel.
+    /// `usize::MAX`: all. Of an object that is partly hidden, or of more than 168 starts, twice as many, where rays are not cast at every pixel.
     pub keep: usize,
     /// Whether the object is compared as it would be in the model's light, where [`Query::coverage`](crate::Query::coverage) is known: see [`Light`](crate::Light). From wrong
     /// poses the light looks wrong, too. In the phases before the first such one each hypothesis has a light of its own, if no outline is in sight: then colours are all there is.

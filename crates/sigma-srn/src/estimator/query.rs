@@ -24,8 +24,12 @@ const CLOSER_BY: [f64; 2] = [0.88, 1.0 / 0.88];
 /// How many [`closer_looks`] there are of a camera.
 pub(super) const CLOSER_LOOKS: usize = 9;
 
-/// How many times as many hypotheses of a partly hidden object go on while rays are few: what is in sight looks the same from more sides.
-const OF_HIDDEN: usize = 2;
+/// How many times as many hypotheses go on, while rays are few, of a partly hidden object, or of many starts: what is in sight looks the same from more sides, and
+/// among more of them more wrong ones look right.
+const OF_DOUBTFUL: usize = 2;
+
+/// More starts than this are many: of all rolls.
+const MANY_STARTS: usize = 168;
 
 /// Less than this of an object in sight is taken for this much: of what it says of a pose nothing is known.
 const LEAST_IN_SIGHT: f64 = 0.1;
@@ -128,8 +132,8 @@ impl Query {
         if phase.outlines {
             return if self.has_outline() { phase.keep } else { 0 };
         }
-        let is_wide = phase.stride > 1 && self.hidden_side().is_some();
-        phase.keep.saturating_mul(if is_wide { OF_HIDDEN } else { 1 })
+        let is_wide = phase.stride > 1 && (self.starts.len() > MANY_STARTS || self.hidden_side().is_some());
+        phase.keep.saturating_mul(if is_wide { OF_DOUBTFUL } else { 1 })
     }
 
     /// How many rays there are in the phase in which there are the most.
@@ -260,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn of_an_object_that_is_partly_hidden_twice_as_many_go_on_while_rays_are_few() {
+    fn of_an_object_that_is_partly_hidden_or_of_many_starts_twice_as_many_go_on_while_rays_are_few() {
         let disc = |pixel: i32| f32::from(((pixel % 64 - 32).pow(2) + (pixel / 64 - 32).pow(2)) < 400);
         let coverage = Some((0..64 * 64).map(disc).collect());
         let whole = Query { coverage, ..blank() };
@@ -269,6 +273,10 @@ mod tests {
         assert_eq!(keep(&whole), [usize::MAX, 12, 6, 2, 1, 1, 1]);
         assert_eq!(keep(&half), [usize::MAX, 24, 12, 4, 1, 1, 1]);
         assert_eq!(keep(&blank()), [usize::MAX, 12, 6, 2, 0, 1, 1]);
+        let of = |starts: usize| Query { starts: vec![DMat4::IDENTITY; starts], ..half.clone() };
+        assert_eq!(keep(&of(MANY_STARTS + 1)), keep(&half), "not four times as many");
+        let of = |starts: usize| Query { starts: vec![DMat4::IDENTITY; starts], ..whole.clone() };
+        assert_eq!([MANY_STARTS, MANY_STARTS + 1].map(|starts| keep(&of(starts))), [keep(&whole), keep(&half)]);
     }
 
     #[test]
