@@ -1,4 +1,4 @@
-//! `robustness [TABLE…] [--seed N]`: pictures like photographs of the asset objects, spoiled in known ways, and how far off `sigma-pose estimate` ends: tables
+//! `robustness [TABLE…] [--seed N] [--starts STARTS]`: pictures like photographs of the asset objects, spoiled in known ways, and how far off `sigma-pose estimate` ends: tables
 //! of `docs/accuracy.md`. The pictures are left in `demo/robustness`.
 
 mod photo;
@@ -19,7 +19,8 @@ use crate::photo::{OUTSIDE, Photo, SIDE, Spoil, Spoiled, exposed};
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [others] [--seed N]";
+const USAGE: &str =
+    "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [others] [--seed N] [--starts STARTS]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -168,18 +169,19 @@ fn main() -> ExitCode {
 }
 
 fn run() -> Result<()> {
-    let (mut wanted, mut seed) = (Vec::new(), 23);
+    let (mut wanted, mut seed, mut starts) = (Vec::new(), 23, "around576".to_string());
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
             "--seed" => seed = arguments.next().and_then(|text| text.parse().ok()).ok_or(USAGE)?,
+            "--starts" => starts = arguments.next().ok_or(USAGE)?,
             name => wanted.push(TABLES.iter().find(|table| table.name == name).ok_or(USAGE)?),
         }
     }
     if wanted.is_empty() {
         wanted.extend(&TABLES);
     }
-    let programs = Programs { folder: std::env::current_exe()?.parent().ok_or("no folder")?.into() };
+    let programs = Programs { folder: std::env::current_exe()?.parent().ok_or("no folder")?.into(), starts };
     let mut shown = Vec::new();
     for table in wanted {
         println!("\n{}, seed {seed}, {} pictures each, made in {OUT}\n", table.name, VIEWS * OBJECTS.len());
@@ -253,6 +255,8 @@ struct Found {
 /// The programs, which lie beside this one.
 struct Programs {
     folder: PathBuf,
+    /// Where nothing is known of the pose.
+    starts: String,
 }
 
 impl Programs {
@@ -295,9 +299,10 @@ impl Programs {
             estimate.args(["estimate", "--json", "--executor", "cpu", "--model", MODEL, "--effort", how.effort]);
             estimate.args(["--instance", OBJECTS[claimed % OBJECTS.len()].0]);
             estimate.arg(&picture.picture).arg("--intrinsics").arg(&picture.intrinsics).arg("--truth").arg(&picture.truth);
-            if how.rough {
-                estimate.arg("--rough").arg(&picture.truth);
-            }
+            match how.rough {
+                true => estimate.arg("--rough").arg(&picture.truth),
+                false => estimate.arg("--starts").arg(&self.starts),
+            };
             if let Some(mask) = &picture.mask {
                 estimate.arg("--mask").arg(mask);
             }
