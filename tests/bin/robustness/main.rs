@@ -15,7 +15,7 @@ use rand_pcg::Pcg64Mcg;
 use serde_json::Value;
 use srn_data::sheet;
 
-use crate::photo::{OUTSIDE, Photo, SIDE, Spoil, Spoiled, exposed};
+use crate::photo::{Lit, OUTSIDE, Photo, SIDE, Spoil, Spoiled, exposed};
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
@@ -45,6 +45,9 @@ const COLUMNS: usize = 6;
 /// Focal length of most, and of those from so near that they are 90° across.
 const FOCAL: f64 = 297.6;
 const WIDE: f64 = 128.0;
+
+const STOP_LESS: Lit = |colour, _| exposed(colour, [0.5; 3]);
+const STOP_MORE: Lit = |colour, _| exposed(colour, [2.0; 3]);
 
 /// What is known of the pose, and how hard the search tries.
 #[derive(Clone, Copy)]
@@ -96,7 +99,7 @@ const TABLES: [Table; 8] = [
         searches: &[AROUND, AROUND_FAST],
         rows: &[
             rolled("cut out", Spoil::Nothing),
-            rolled("1 stop less", Spoil::Light(|colour, _| exposed(colour, [0.5; 3]))),
+            rolled("1 stop less", Spoil::Light(STOP_LESS)),
             rolled("3/10 hidden", Spoil::Bar(0.3)),
             rolled("half hidden", Spoil::Bar(0.5)),
         ],
@@ -109,8 +112,8 @@ const TABLES: [Table; 8] = [
         searches: &[AROUND_FAST],
         rows: &[
             row("the model's", Spoil::Nothing),
-            row("1 stop less", Spoil::Light(|colour, _| exposed(colour, [0.5; 3]))),
-            row("1 stop more", Spoil::Light(|colour, _| exposed(colour, [2.0; 3]))),
+            row("1 stop less", Spoil::Light(STOP_LESS)),
+            row("1 stop more", Spoil::Light(STOP_MORE)),
             row("redder", Spoil::Light(|colour, _| exposed(colour, [1.4, 1.0, 1.0 / 1.4]))),
             row("less contrast", Spoil::Light(|colour, _| colour.map(|v| 0.5 + 0.6 * (v - 0.5)))),
             row("from the right", Spoil::Light(|colour, right| exposed(colour, [0.4 + 1.2 * right; 3]))),
@@ -142,8 +145,8 @@ const TABLES: [Table; 8] = [
         searches: &[AROUND, AROUND_FAST],
         rows: &[
             row("the model's", Spoil::Alone(|colour, _| colour)),
-            row("1 stop less", Spoil::Alone(|colour, _| exposed(colour, [0.5; 3]))),
-            row("1 stop more", Spoil::Alone(|colour, _| exposed(colour, [2.0; 3]))),
+            row("1 stop less", Spoil::Alone(STOP_LESS)),
+            row("1 stop more", Spoil::Alone(STOP_MORE)),
         ],
     },
     Table {

@@ -158,11 +158,13 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let rough = poses("--rough", &args.rough, &args.images, &notation)?;
     let pictures = pictures(args, &model, side, &notation)?;
     let sources = args.images.iter().map(|path| args.poses.source(srn_instance(path).as_deref())).collect::<Result<Vec<_>>>()?;
-    let default = match args.unseen {
-        _ if !args.rough.is_empty() => Starts::Neighbor4,
-        // As many for each known object would take minutes.
-        true => Starts::Around84,
-        false => args.search.all_around(),
+    let default = if !args.rough.is_empty() {
+        Starts::Neighbor4
+    } else if args.unseen {
+        // As many as otherwise, for each known object, would take minutes.
+        Starts::Around84
+    } else {
+        args.search.all_around()
     };
     let starts = args.starts.as_ref().unwrap_or(&default);
     if !args.rough.is_empty() && *starts != Starts::Neighbor4 {

@@ -273,10 +273,9 @@ mod tests {
         assert_eq!(keep(&whole), [usize::MAX, 12, 6, 2, 1, 1, 1]);
         assert_eq!(keep(&half), [usize::MAX, 24, 12, 4, 1, 1, 1]);
         assert_eq!(keep(&blank()), [usize::MAX, 12, 6, 2, 0, 1, 1]);
-        let of = |starts: usize| Query { starts: vec![DMat4::IDENTITY; starts], ..half.clone() };
-        assert_eq!(keep(&of(MANY_STARTS + 1)), keep(&half), "not four times as many");
-        let of = |starts: usize| Query { starts: vec![DMat4::IDENTITY; starts], ..whole.clone() };
-        assert_eq!([MANY_STARTS, MANY_STARTS + 1].map(|starts| keep(&of(starts))), [keep(&whole), keep(&half)]);
+        let from = |starts: usize, query: &Query| keep(&Query { starts: vec![DMat4::IDENTITY; starts], ..query.clone() });
+        assert_eq!([0, 1].map(|more| from(MANY_STARTS + more, &whole)), [keep(&whole), keep(&half)]);
+        assert_eq!(from(MANY_STARTS + 1, &half), keep(&half), "not four times as many");
     }
 
     #[test]
