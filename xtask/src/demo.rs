@@ -35,10 +35,10 @@ pub fn run(arguments: &[String]) -> Result<(), String> {
         accept(evaluate.status())?;
     }
 
-    println!("\nOne search in pictures, from all around (around576):\n");
+    println!("\nOne search in pictures, from all around (around2016):\n");
     let mut estimate = sigma_pose("estimate", model, "cpu");
     estimate.arg(format!("{VIEWS}/{SHOWN}.png"));
-    estimate.args(["--starts", "around576", "--truth", "auto", "--force", "--record", &format!("{OUT}/around576")]);
+    estimate.args(["--starts", "around2016", "--truth", "auto", "--force", "--record", &format!("{OUT}/around2016")]);
     accept(estimate.status())?;
 
     println!("\nThe pose found for {SHARED}, refined by both executors:\n");

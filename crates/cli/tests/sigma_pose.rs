@@ -101,7 +101,9 @@ fn executors_agree_and_json_says_everything() {
         let rotation = DMat4::from_rotation_x(a1) * DMat4::from_rotation_y(a2) * DMat4::from_rotation_z(a3);
         assert!((DMat4::from_translation(t.into()) * rotation).abs_diff_eq(a, 1e-9));
         let ranking = cpu["ranking"].as_array().unwrap();
-        assert_eq!((ranking.len(), &ranking[0]["start"], &ranking[0]["loss"]), (576, &cpu["start"], &cpu["loss"]));
+        assert_eq!((&ranking[0]["start"], &ranking[0]["loss"]), (&cpu["start"], &cpu["loss"]));
+        // Of 2016 starts those that went on after the first look.
+        assert!((24..60).contains(&ranking.len()) && ranking.iter().all(|r| r["phases"].as_u64() > Some(1)), "{}", ranking.len());
         assert_eq!(ranking[0]["error"], cpu["error"]);
         let key = |r: &Value| (std::cmp::Reverse(r["phases"].as_u64().unwrap()), r["loss"].as_f64().unwrap());
         assert!(ranking.windows(2).all(|pair| key(&pair[0]) <= key(&pair[1])));

@@ -33,7 +33,7 @@ fn main() -> Result<(), sigma_srn::Error> {
             width: SIDE,
             height: SIDE,
             intrinsics,
-            starts: camera::around576(radius),
+            starts: camera::around2016(radius),
         };
         let Tracked { found, is_searched } = tracker.next(query, |_| Ok(()))?;
         let (rotation, translation) = camera::pose_error(&found.world_from_camera, &truth);

@@ -109,11 +109,11 @@ pub fn around84(radius: f64) -> Vec<DMat4> {
     rings(radius, &[85.0, 60.0, 30.0, 0.0, -30.0, -60.0, -85.0], 12)
 }
 
-/// Starts `around576`: 48 places evenly around the object at `radius`, looking at the origin, each with 12 rolls: for cameras that need not be
-/// upright, and objects that need not stand. No view of the object's centre is farther than 24° from one of them.
-pub fn around576(radius: f64) -> Vec<DMat4> {
-    const PLACES: u32 = 48;
-    const ROLLS: u32 = 12;
+/// Starts `around2016`: 84 places evenly around the object at `radius`, looking at the origin, each with 24 rolls, one after the other: for cameras that need not be
+/// upright, and objects that need not stand. No view of the object's centre is farther than 17° from one of them.
+pub fn around2016(radius: f64) -> Vec<DMat4> {
+    const PLACES: u32 = 84;
+    const ROLLS: u32 = 24;
     let rolls = |eye: DVec3| {
         let roll = |k| DMat4::from_rotation_z(f64::from(k) * std::f64::consts::TAU / f64::from(ROLLS));
         (0..ROLLS).map(move |k| look_at_origin(eye) * roll(k))
@@ -210,10 +210,10 @@ mod tests {
             (0..).zip(spiral(2000)).map(view).map(nearest).fold(0.0, f64::max)
         };
         let upright = farthest(&around84(1.3), 0.0);
-        let rolled = farthest(&around576(1.3), 1.0);
+        let rolled = farthest(&around2016(1.3), 1.0);
         println!("upright {upright:.1}°, rolled {rolled:.1}°");
-        assert!(upright < 21.0 && rolled < 24.0, "{upright}° {rolled}°");
-        assert_eq!([around84(1.3).len(), around576(1.3).len()], [84, 576]);
+        assert!(upright < 21.0 && rolled < 17.0, "{upright}° {rolled}°");
+        assert_eq!([around84(1.3).len(), around2016(1.3).len()], [84, 2016]);
     }
 
     #[test]

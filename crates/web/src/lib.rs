@@ -12,7 +12,7 @@ use std::path::Path;
 use glam::DMat4;
 use js_sys::futures::jspi_block_on_promise;
 use js_sys::{Function, Promise};
-use sigma_srn::camera::{around576, neighbor4};
+use sigma_srn::camera::{around2016, neighbor4};
 use sigma_srn::{Effort, Engine, Gpu, Intrinsics, Model, Options, Outline, Query, Renderer, Search, wgpu};
 use wasm_bindgen::prelude::*;
 
@@ -78,7 +78,7 @@ impl Session {
         let rgb = pixels.flat_map(|(pixel, &covered)| [0, 1, 2].map(|k| colour(pixel[k], covered))).collect();
         let starts = match rough {
             Some(rough) => neighbor4(&pose(&rough)?),
-            None => around576(self.distance()),
+            None => around2016(self.distance()),
         };
         let query = Query {
             instance,

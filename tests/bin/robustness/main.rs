@@ -172,7 +172,7 @@ fn main() -> ExitCode {
 }
 
 fn run() -> Result<()> {
-    let (mut wanted, mut seed, mut starts) = (Vec::new(), 23, "around576".to_string());
+    let (mut wanted, mut seed, mut starts) = (Vec::new(), 23, "around2016".to_string());
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         match argument.as_str() {

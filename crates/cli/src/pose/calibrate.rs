@@ -54,7 +54,7 @@ pub struct Calibrate {
     #[arg(long)]
     force: bool,
     /// Where to start; see `evaluate`.
-    #[arg(long, value_name = "around576|around84|fixed24|neighbor4|FILE", default_value = "around84")]
+    #[arg(long, value_name = "around2016|around84|fixed24|neighbor4|FILE", default_value = "around84")]
     starts: Starts,
     /// Views of each instance, evenly spread over those that there are.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]

@@ -46,11 +46,11 @@ pub struct Estimate {
     /// Like --cutout.
     #[arg(long, value_name = "FILE|DIR")]
     mask: Vec<PathBuf>,
-    /// Where to start: `around576`, all around, with every roll; `around84`, all around, the camera upright and the object standing as in training, in half the
-    /// time; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file with 16 numbers per line, or in four lines, a `world_from_camera`
-    /// each. Default: `neighbor4` with --rough, `fixed24` with --preset paper, `around84` with --unseen, else `around576`. Where there are fewer than 84, six more
+    /// Where to start: `around2016`, all around, with every roll; `around84`, all around, the camera upright and the object standing as in training, in two thirds of
+    /// the time; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file with 16 numbers per line, or in four lines, a `world_from_camera`
+    /// each. Default: `neighbor4` with --rough, `fixed24` with --preset paper, `around84` with --unseen, else `around2016`. Where there are fewer than 84, six more
     /// are tried around each, turned by 40° about the object; numbers of starts count from 0, the given ones first.
-    #[arg(long, value_name = "around576|around84|fixed24|neighbor4|FILE")]
+    #[arg(long, value_name = "around2016|around84|fixed24|neighbor4|FILE")]
     starts: Option<Starts>,
     /// Roughly known pose: a pose file, or `auto`, the one in the picture's SRN folder. Once, or once per picture.
     #[arg(long, value_name = "POSE")]
@@ -125,7 +125,7 @@ struct ImageReport {
     error: Option<PoseError>,
     /// Whether the true pose lies within the stated 95 % ellipsoid.
     within_95: Option<bool>,
-    /// All starts, the winner first.
+    /// The starts that went on after the first phase, the winner first.
     ranking: Vec<RankedReport>,
     seconds: f64,
 }
@@ -339,6 +339,8 @@ impl Output<'_> {
             phases: r.phases,
             error: error(&r.pose.to_matrix()),
         };
+        let phases = found.estimate.ranking[0].phases;
+        let went_on = |r: &&sigma_srn::Ranked| r.phases > 1 || r.phases == phases;
         let rival = |(r, higher): (&sigma_srn::Ranked, f64)| Rival {
             start: r.start,
             higher,
@@ -367,7 +369,7 @@ impl Output<'_> {
             start: found.estimate.ranking[0].start,
             error: error(&found.world_from_camera),
             within_95: picture.truth.and_then(|truth| within_95(self.on.model, picture.instance, found, &truth)),
-            ranking: found.estimate.ranking.iter().map(ranked).collect(),
+            ranking: found.estimate.ranking.iter().filter(went_on).map(ranked).collect(),
             seconds: found.seconds,
         }
     }

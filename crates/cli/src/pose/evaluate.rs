@@ -33,9 +33,9 @@ pub struct Evaluate {
     /// Data set in the SRN folder layout, of views that the model has not seen; instances are matched by name.
     #[arg(long, value_name = "DIR")]
     pub(super) data: PathBuf,
-    /// Where to start: `neighbor4`, the true pose turned by 30° to four sides; `around576`, all around, with every roll; `around84`, all around, the camera upright; `fixed24`, the paper's fewer;
+    /// Where to start: `neighbor4`, the true pose turned by 30° to four sides; `around2016`, all around, with every roll; `around84`, all around, the camera upright; `fixed24`, the paper's fewer;
     /// or a file with 16 numbers per line, or in four lines, a `world_from_camera` each.
-    #[arg(long, value_name = "neighbor4|around576|around84|fixed24|FILE", default_value = "neighbor4")]
+    #[arg(long, value_name = "neighbor4|around2016|around84|fixed24|FILE", default_value = "neighbor4")]
     pub(super) starts: Starts,
     /// Views of each instance, evenly spread over those that there are.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]

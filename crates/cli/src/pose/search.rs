@@ -6,7 +6,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::camera::{around84, around576, fixed24, neighbor4, pose_error};
+use sigma_srn::camera::{around84, around2016, fixed24, neighbor4, pose_error};
 use sigma_srn::{
     Confidence, Effort, Engine, Error, Found, Loss, Method, Model, Options, Progress, Query, Rendering, Search, View,
     render_views,
@@ -68,7 +68,7 @@ pub struct SearchArgs {
     /// that is nearer or farther than the model knows, nor an object half as large in the picture as when the model was calibrated.
     #[arg(long, value_name = "X", value_parser = positive)]
     accept: Option<f64>,
-    /// Distance of the starts of `around576`, `around84` and `fixed24` from the object's centre, in object units. Default: by the size of the object in a
+    /// Distance of the starts of `around2016`, `around84` and `fixed24` from the object's centre, in object units. Default: by the size of the object in a
     /// photograph that is cut around it, else as the model was trained.
     #[arg(long, value_name = "R", value_parser = positive)]
     radius: Option<f64>,
@@ -110,8 +110,8 @@ fn loss(name: String) -> Loss {
 /// Where searches start.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Starts {
-    /// 48 places around the object × 12 rolls.
-    Around576,
+    /// 84 places around the object × 24 rolls.
+    Around2016,
     /// 12 azimuths × 7 elevations around the object, the camera upright.
     Around84,
     /// 8 azimuths × 3 elevations around the object, the paper's.
@@ -125,7 +125,7 @@ pub enum Starts {
 impl From<&str> for Starts {
     fn from(text: &str) -> Self {
         match text {
-            "around576" => Starts::Around576,
+            "around2016" => Starts::Around2016,
             "around84" => Starts::Around84,
             "fixed24" => Starts::Fixed24,
             "neighbor4" => Starts::Neighbor4,
@@ -137,7 +137,7 @@ impl From<&str> for Starts {
 impl std::fmt::Display for Starts {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
-            Starts::Around576 => "around576",
+            Starts::Around2016 => "around2016",
             Starts::Around84 => "around84",
             Starts::Fixed24 => "fixed24",
             Starts::Neighbor4 => "neighbor4",
@@ -227,7 +227,7 @@ impl SearchArgs {
     /// Where to start where nothing is known of the pose.
     pub fn all_around(&self) -> Starts {
         match self.preset {
-            Preset::Default => Starts::Around576,
+            Preset::Default => Starts::Around2016,
             Preset::Paper => Starts::Fixed24,
         }
     }
@@ -250,12 +250,12 @@ impl SearchArgs {
         notation: &Notation,
     ) -> Result<Vec<DMat4>> {
         match starts {
-            Starts::Around576 => self.around(around576, model, picture, side),
+            Starts::Around2016 => self.around(around2016, model, picture, side),
             Starts::Around84 => self.around(around84, model, picture, side),
             Starts::Fixed24 => self.around(fixed24, model, picture, side),
             Starts::Neighbor4 => Ok(neighbor4(rough.ok_or("--starts neighbor4 turns a rough pose: give --rough")?)),
             Starts::File(path) if !path.exists() => Err(format!(
-                "--starts {}: no such file; expected around576, around84, fixed24, neighbor4 or a file",
+                "--starts {}: no such file; expected around2016, around84, fixed24, neighbor4 or a file",
                 path.display()
             )
             .into()),

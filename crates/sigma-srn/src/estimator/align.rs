@@ -1,73 +1,19 @@
 //! Where an object lies in a picture, and how large it is there: a camera whose distance and aim are guesses is moved until its view shows the object
 //! at the same place, as large. Else a view from the right side, but from too near, looks worse than one from a wrong side.
 
-use std::iter::zip;
-
 use glam::{DMat2, DMat4, DQuat, DVec2, DVec3};
 
-use super::Hypothesis;
-use super::options::Options;
-use super::query::Query;
-use super::targets::Targets;
-use crate::Error;
-use crate::camera::{Intrinsics, Pose6};
-use crate::engine::Engine;
+use crate::camera::Intrinsics;
 use crate::mask::has_outline;
-use crate::model::Model;
 
 /// How much darker than white a channel is that shows the object for certain (colours span 2). A fainter one counts less: its edges are half white.
 const DARK: f64 = 0.7;
 /// By which factor a camera comes nearer, or goes farther away, at most: another side of the object may be half as large.
 const MOST: f64 = 1.5;
 
-/// Moves the starts of images whose coverage is known, see [`Options::align`].
-pub(super) fn align(
-    engine: &Engine,
-    model: &Model,
-    queries: &[Query],
-    options: &Options,
-    hypotheses: &mut [Hypothesis],
-) -> Result<(), Error> {
-    let mut starts: Vec<&mut Hypothesis> = hypotheses.iter_mut().filter(|h| queries[h.query].coverage.is_some()).collect();
-    let running: Vec<Hypothesis> = starts.iter().map(|h| **h).collect();
-    if running.is_empty() {
-        return Ok(());
-    }
-    let (phase, method) = (&options.phases[0], options.method);
-    let targets = Targets::new(queries, options, phase, &running);
-    let mut views = targets.descent(engine, model, method, false, &running)?;
-    views.compare()?;
-    let renders = views.rgb()?;
-    let values = 3 * targets.rays_per_image();
-    let hidden: Vec<Option<DVec2>> = queries.iter().map(Query::hidden_side).collect();
-    // By number of the start: aligned as if nothing, and as if something of the object were hidden.
-    let mut either: Vec<(usize, [Pose6; 2])> = Vec::new();
-    for (k, (rgb, render)) in zip(targets.rgb.chunks(values), renders.chunks(values)).enumerate() {
-        let (query, start) = (&queries[running[k].query], running[k].pose.to_matrix());
-        let weights = query.seen(running[k].outline).ray_weights(query.pixels(phase.stride));
-        let shown = |rgb: &[f32], weights: &[f32]| Shown::of(rgb, weights, query.rays(phase.stride));
-        let aligned = |wanted: Shown, now: &Shown| Pose6::from_matrix(&wanted.seen_by(now, &start, &query.intrinsics));
-        let (Some(wanted), Some(in_sight)) = (shown(rgb, &weights), shown(render, &weights)) else { continue };
-        starts[k].pose = aligned(wanted, &in_sight);
-        if let (Some(side), Some(all)) = (hidden[running[k].query], shown(render, &vec![1.0; weights.len()])) {
-            either.push((k, [starts[k].pose, aligned(wanted.whole(&all, side), &all)]));
-        }
-    }
-    if !either.is_empty() {
-        let tried = either.iter().flat_map(|(k, poses)| poses.map(|pose| Hypothesis { pose, ..running[*k] }));
-        let tried: Vec<Hypothesis> = tried.collect();
-        let mut views = Targets::new(queries, options, phase, &tried).descent(engine, model, method, false, &tried)?;
-        views.compare()?;
-        for ((k, poses), losses) in zip(either, views.standing()?.chunks(2)) {
-            starts[k].pose = poses[usize::from(losses[1].0 < losses[0].0)];
-        }
-    }
-    Ok(())
-}
-
 /// An object in a picture, in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Shown {
+pub(super) struct Shown {
     centre: DVec2,
     /// Of the places of what is dark.
     covariance: DMat2,
@@ -75,7 +21,7 @@ struct Shown {
 
 impl Shown {
     /// What is darker than white. `rgb [pixels, 3]`, how much each pixel counts, and where it is. `None` where that is nothing, or of no size.
-    fn of(rgb: &[f32], weights: &[f32], pixels: impl Iterator<Item = (u32, u32)>) -> Option<Self> {
+    pub fn of(rgb: &[f32], weights: &[f32], pixels: impl Iterator<Item = (u32, u32)>) -> Option<Self> {
         let (mut sum, mut first, mut second) = (0.0, DVec2::ZERO, DMat2::ZERO);
         for ((colours, &weight), (u, v)) in rgb.chunks_exact(3).zip(weights).zip(pixels) {
             let darkest = colours.iter().map(|&colour| 1.0 - f64::from(colour)).fold(0.0, f64::max);
@@ -100,19 +46,21 @@ impl Shown {
     }
 
     /// The whole object, of which this is in sight and the rest hidden on the side of `hidden`, if it has the shape of `now`: it is as large across, and ends where
-    /// this ends on the other side.
-    fn whole(&self, now: &Shown, hidden: DVec2) -> Shown {
+    /// this ends on the other side. `guess` is by how much it is larger than that (logarithm of the factor), and how far it lies farther towards the hidden side, and aside, both in its own
+    /// deviations.
+    pub fn whole(&self, now: &Shown, hidden: DVec2, guess: DVec3) -> Shown {
         let towards = (hidden - self.centre).normalize_or_zero();
         let across = towards.perp();
-        let larger = self.along(across) / now.along(across);
+        let larger = self.along(across) / now.along(across) * guess.x.exp();
         // Of what is as dark everywhere the end is √3 deviations from the centre.
-        let shift = 3f64.sqrt() * (larger * now.along(towards) - self.along(towards));
-        Shown { centre: self.centre + shift.max(0.0) * towards, covariance: now.covariance * (larger * larger) }
+        let shift = (3f64.sqrt() * (larger * now.along(towards) - self.along(towards))).max(0.0);
+        let farther = larger * (guess.y * now.along(towards) * towards + guess.z * now.along(across) * across);
+        Shown { centre: self.centre + shift * towards + farther, covariance: now.covariance * (larger * larger) }
     }
 
     /// The camera from which the object lies like this that lies like `now` as it is seen from this one: as much nearer or farther away, then turned about
     /// itself, so that it sees the same side.
-    fn seen_by(&self, now: &Shown, world_from_camera: &DMat4, intrinsics: &Intrinsics) -> DMat4 {
+    pub fn seen_by(&self, now: &Shown, world_from_camera: &DMat4, intrinsics: &Intrinsics) -> DMat4 {
         let larger = (self.spread() / now.spread()).clamp(1.0 / MOST, MOST);
         let origin = world_from_camera.inverse().transform_point3(DVec3::ZERO);
         let Intrinsics { fx, fy, cx, cy, pixel_center } = *intrinsics;
@@ -201,12 +149,18 @@ mod tests {
         assert!((side.x - 31.5).abs() < 1e-9 && (side.y - 31.5).abs() < 3.0, "{side}");
         let in_sight = Shown::of(&rgb, &weights, crate::pixel_grid(SIDE, SIDE, 1)).unwrap();
         let now = shown(&now).unwrap();
-        let errors = [in_sight, in_sight.whole(&now, side)].map(|wanted| {
+        let errors = [in_sight, in_sight.whole(&now, side, DVec3::ZERO)].map(|wanted| {
             let (degrees, far) = crate::camera::pose_error(&wanted.seen_by(&now, &guess, &intrinsics), &truth);
             (degrees, far / 1.3)
         });
         assert!(errors[0].0 > 4.0 && errors[0].1 > 0.15, "{errors:?}");
         assert!(errors[1].0 < 1.0 && errors[1].1 < 0.05, "{errors:?}");
+        // A guess by how much it is larger, and lies elsewhere: towards the right, where it is hidden, and down.
+        let whole = |guess: DVec3| in_sight.whole(&now, side, guess);
+        let [first, larger, shifted] = [DVec3::ZERO, DVec3::X * 1.2f64.ln(), DVec3::new(0.0, 0.5, 0.3)].map(whole);
+        assert!((larger.spread() / first.spread() - 1.2).abs() < 1e-9);
+        let by = [shifted.centre - first.centre, DVec2::new(0.5 * first.along(DVec2::X), 0.3 * first.along(DVec2::Y))];
+        assert!((by[0].abs() - by[1]).abs().max_element() < 0.1 * by[1].length() && by[0].x > 0.0, "{by:?}");
         // Nothing is hidden; nothing of the outline is in sight.
         assert_eq!(hidden_side(&coverage, &[1.0; (SIDE * SIDE) as usize], SIDE as usize), None);
         assert_eq!(hidden_side(&[1.0; (SIDE * SIDE) as usize], &weights, SIDE as usize), None);

@@ -1,7 +1,9 @@
 //! Pose estimation (spec 4): many starts per image in one batch, the unpromising ones dropped between phases.
 
 mod align;
+mod look;
 mod options;
+mod place;
 mod query;
 mod targets;
 
@@ -11,7 +13,7 @@ use std::iter::{self, zip};
 use glam::DMat4;
 use serde::Serialize;
 
-use self::align::align;
+use self::look::look;
 pub use self::options::{Effort, Options, Phase};
 pub use self::query::Query;
 use self::query::{CLOSER_LOOKS, TURN_DEG, closer_looks, turned};
@@ -144,11 +146,12 @@ pub fn estimate(
         hypotheses.extend(query.all_starts(options).iter().enumerate().map(new));
     }
     prove(engine, model, queries, options, &hypotheses)?;
-    if options.align {
-        align(engine, model, queries, options, &mut hypotheses)?;
+    let first_look = options.first_look();
+    if let Some(how) = first_look {
+        look(engine, model, queries, options, how, &mut hypotheses)?;
     }
     let mut course = Course::new(engine, model, queries, options, observe);
-    for number in 0..options.phases.len() {
+    for number in usize::from(first_look.is_some())..options.phases.len() {
         hypotheses = course.phase(number, &hypotheses)?;
     }
     for _ in 0..options.anew {
@@ -446,11 +449,18 @@ fn split_off_late(hypotheses: &[Hypothesis], queries: usize, phases: usize) -> (
 
 /// Takes those out of a query's hypotheses, the best first, that have come to where a better one stands.
 fn split_off_met(own: &mut Vec<Hypothesis>) -> Vec<Hypothesis> {
-    let mut met = Vec::new();
+    let (mut met, mut matrices) = (Vec::new(), Vec::<DMat4>::new());
     for hypothesis in std::mem::take(own) {
         let here = hypothesis.pose.to_matrix();
-        let is_here = |better: &Hypothesis| motion(&better.pose.to_matrix(), &here).iter().all(|by| by.abs() < MET);
-        if own.iter().any(is_here) { &mut met } else { &mut *own }.push(hypothesis);
+        // Of thousands most are told apart by where their axes point.
+        let looks_along = |better: &DMat4| (better.z_axis - here.z_axis).abs().max_element() < 2.0 * MET;
+        let is_here = |better: &DMat4| looks_along(better) && motion(better, &here).iter().all(|by| by.abs() < MET);
+        if matrices.iter().any(is_here) {
+            met.push(hypothesis);
+        } else {
+            own.push(hypothesis);
+            matrices.push(here);
+        }
     }
     met
 }
@@ -477,6 +487,9 @@ pub(crate) fn check(model: &Model, queries: &[Query], options: &Options) -> Resu
     };
     if options.phases.is_empty() {
         return setting("phases", "there are none");
+    }
+    if options.align && options.first_look().is_none() {
+        return setting("align", "starts are moved in a first look: the first phase needs BFGS and no steps");
     }
     for phase in &options.phases {
         if phase.stride == 0 || phase.keep == 0 {

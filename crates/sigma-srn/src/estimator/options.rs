@@ -2,6 +2,7 @@
 
 use std::iter::{self, zip};
 
+use super::query::Query;
 use crate::descent::{Loss, Method};
 
 /// What steps at every pixel are multiples of, in radians and object units: a sixtieth of a pixel of 64 at most, and a number that sums of it are exact of.
@@ -156,6 +157,19 @@ impl Options {
             self.phases.insert(self.phases.len() - 1, first);
         }
         self
+    }
+
+    /// The first phase where it is a look at all starts, which compares them as they are, without steps; and [`Method::Bfgs`]'s `soft`.
+    pub(super) fn first_look(&self) -> Option<(&Phase, f32)> {
+        let is_look = |phase: &&Phase| phase.steps == 0 && !(phase.light || phase.closer_look || phase.outlines);
+        let Method::Bfgs { soft, .. } = self.method else { return None };
+        Some((self.phases.first().filter(is_look)?, soft))
+    }
+
+    /// Whether each hypothesis is compared in a light of its own before the phases that make up for the image's. Without an outline in sight colours are all there is:
+    /// in another light no pose would look right before those.
+    pub(super) fn has_own_lights(&self, query: &Query) -> bool {
+        self.phases.iter().any(|phase| phase.light) && query.coverage.is_some() && !query.has_outline()
     }
 
     pub(crate) fn is_gmsd(&self) -> bool {

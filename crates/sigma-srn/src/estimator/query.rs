@@ -138,12 +138,15 @@ impl Query {
 
     /// How many rays there are in the phase in which there are the most.
     pub(crate) fn most_rays(&self, options: &Options) -> usize {
-        let starts = self.all_starts(options).len();
-        let rays = |phase: &Phase| {
+        let starts = self.all_starts(options);
+        // A look renders each place once, with rays half as far apart where it makes other views of that.
+        let places = starts.chunk_by(|one, other| one.w_axis == other.w_axis).count();
+        let look = options.first_look().map(|(look, _)| places * self.rays(look.stride.div_ceil(2)).count());
+        let others = options.phases.iter().skip(usize::from(look.is_some())).map(|phase| {
             let tried = if phase.outlines { outlines().count() } else { 1 } * if phase.closer_look { CLOSER_LOOKS } else { 1 };
-            tried * starts.min(self.keep(phase)) * self.rays(phase.stride).count()
-        };
-        options.phases.iter().map(rays).max().unwrap_or(0)
+            tried * starts.len().min(self.keep(phase)) * self.rays(phase.stride).count()
+        });
+        look.into_iter().chain(others).max().unwrap_or(0)
     }
 
     /// Says what is wrong with it.

@@ -63,6 +63,11 @@ impl Targets {
         (self.shape.width * self.shape.height) as usize
     }
 
+    /// Rays per row of an image.
+    pub fn columns(&self) -> usize {
+        self.shape.width as usize
+    }
+
     /// Makes up for the light of the image of each query of which `is_made_up` says so. Where the phase is in the model's light, that is the light between it and the
     /// view from the best pose, which is returned; before, each hypothesis has its own.
     fn undo_lights(
@@ -148,9 +153,7 @@ pub(super) fn prepare(
     let mut targets = Targets::new(queries, options, phase, running);
     let method = options.method.with_stride(phase.stride);
     let mut lights = vec![None; queries.len()];
-    // Without an outline in sight colours are all there is: in another light no pose would look right before the last phases.
-    let ever = options.phases.iter().any(|phase| phase.light);
-    let is_made_up = |query: &Query| query.coverage.is_some() && (phase.light || ever && !query.has_outline());
+    let is_made_up = |query: &Query| phase.light && query.coverage.is_some() || options.has_own_lights(query);
     let makes_up = queries.iter().any(is_made_up);
     // The paper's way compares whole images.
     let looks_closer = phase.steps > 0 && matches!(method, Method::Bfgs { .. });
