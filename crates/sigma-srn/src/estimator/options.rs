@@ -11,7 +11,7 @@ const GRAIN: f32 = 1.0 / 4096.0;
 /// Some steps with the same settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Phase {
-    /// Steps; none: the poses are only compared with the image.
+    /// Steps; none: the poses are only compared with the image, in a first phase by one view from each place, turned as the starts there are.
     pub steps: u32,
     /// Every how many pixels, in both directions, a ray is cast; with BFGS only near what the image or the view from a hypothesis's pose at the
     /// beginning of the phase shows: where both are white nothing is to be seen.
@@ -40,9 +40,9 @@ pub struct Options {
     /// Where an image has fewer starts than this, six more are tried around each, turned by 40° about the object: to either side about each
     /// axis of the camera.
     pub min_starts: usize,
-    /// Whether starts are moved first, where [`Query::coverage`](crate::Query::coverage) is known: nearer or farther away, and turned about themselves, until the object is as large and
-    /// at the same place in the views from there, as the first phase would show them, as in the image; where a part of it is hidden, or as the whole of it would
-    /// be, whichever has the lower loss. Else their distance and aim are taken for known.
+    /// Whether the first phase, which has to be a look at all starts without steps, moves them, where [`Query::coverage`](crate::Query::coverage) is known: nearer or farther away, and turned about
+    /// themselves, until the object is as large and at the same place in the views from there as in the image; where a part of it is hidden, or as the whole of it would be, whichever has the
+    /// lower loss. Else their distance and aim are taken for known.
     pub align: bool,
     /// Phases, one after the other.
     pub phases: Vec<Phase>,
