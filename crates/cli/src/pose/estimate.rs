@@ -48,7 +48,7 @@ pub struct Estimate {
     mask: Vec<PathBuf>,
     /// Where to start: `around2016`, all around, with every roll; `around84`, all around, the camera upright and the object standing as in training, in two thirds of
     /// the time; `fixed24`, the paper's fewer; `neighbor4`, 30° to four sides of --rough; or a file with 16 numbers per line, or in four lines, a `world_from_camera`
-    /// each. Default: `neighbor4` with --rough, `fixed24` with --preset paper, `around84` with --unseen, else `around2016`. Where there are fewer than 84, six more
+    /// each. Default: `neighbor4` with --rough, `fixed24` with --preset paper, `around84` with --unseen or --no-cull, else `around2016`. Where there are fewer than 84, six more
     /// are tried around each, turned by 40° about the object; numbers of starts count from 0, the given ones first.
     #[arg(long, value_name = "around2016|around84|fixed24|neighbor4|FILE")]
     starts: Option<Starts>,

@@ -227,6 +227,8 @@ impl SearchArgs {
     /// Where to start where nothing is known of the pose.
     pub fn all_around(&self) -> Starts {
         match self.preset {
+            // Thousands are for looking at, not for following.
+            Preset::Default if self.no_cull => Starts::Around84,
             Preset::Default => Starts::Around2016,
             Preset::Paper => Starts::Fixed24,
         }
