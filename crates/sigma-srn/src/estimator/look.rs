@@ -96,8 +96,8 @@ impl<'a> Wanted<'a> {
             (self.loss(&view(&pose)), pose)
         };
         let as_it_is = moved(wanted, &in_sight);
-        let all: Vec<(u32, u32)> = self.query.rays(self.stride).collect();
-        let whole = || Shown::of(&place.seen_by(start, all.iter().copied()), &vec![1.0; all.len()], all.iter().copied());
+        let all = || self.query.rays(self.stride);
+        let whole = || Shown::of(&place.seen_by(start, all()), &vec![1.0; all().count()], all());
         let Some((side, whole)) = self.hidden.and_then(|side| Some((side, whole()?))) else { return as_it_is };
         let as_hidden = least(|guess| moved(wanted.whole(&whole, side, guess), &whole));
         if as_hidden.0 < as_it_is.0 { as_hidden } else { as_it_is }

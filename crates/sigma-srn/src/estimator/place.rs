@@ -25,10 +25,9 @@ impl Place<'_> {
         let Intrinsics { fx, fy, cx, cy, pixel_center } = self.intrinsics;
         let [(own, place), (turned, eye)] =
             [&self.world_from_camera, world_from_camera].map(|camera| (DMat3::from_mat4(*camera), camera.w_axis.truncate()));
-        // The ray `eye + t · r` meets the plane `n · X = 0` at `t = -(n · eye) / (n · r)`; from the place it is seen in the direction of
-        // `((n · eye) - (eye - place) nᵀ) r`.
-        let n = place.normalize();
-        let towards = |r: DVec3| own.transpose() * (n.dot(eye) * r - (eye - place) * n.dot(r));
+        // The ray `eye + t · r` meets the plane `place · X = 0` at `t = -(place · eye) / (place · r)`.
+        let beside = |r: DVec3| if eye == place { DVec3::ZERO } else { place.dot(r) / place.dot(eye) * (eye - place) };
+        let towards = |r: DVec3| own.transpose() * (r - beside(r));
         let onto = DMat3::from_cols(towards(turned.x_axis), towards(turned.y_axis), towards(turned.z_axis));
         let first = f64::from(self.stride / 2) + pixel_center;
         let colours = pixels.flat_map(|(u, v)| {
@@ -113,13 +112,16 @@ mod tests {
         let at = look_at_origin(DVec3::new(0.9, -0.7, 0.6));
         let rgb = vec![-0.5; 3 * (SIDE * SIDE) as usize];
         let view = Place { rgb: &rgb, columns: SIDE as usize, stride: 1, world_from_camera: at, intrinsics: INTRINSICS };
-        let share = |camera: &DMat4| {
+        let share = |view: &Place, camera: &DMat4| {
             let seen = view.seen_by(camera, pixel_grid(SIDE, SIDE, 1));
             seen.iter().filter(|colour| **colour == 1.0).count() as f32 / seen.len() as f32
         };
-        assert_eq!(share(&at), 0.0);
-        let aside = share(&(at * DMat4::from_rotation_y(0.4)));
+        assert_eq!(share(&view, &at), 0.0);
+        let aside = share(&view, &(at * DMat4::from_rotation_y(0.4)));
         assert!(aside > 0.3 && aside < 0.7, "{aside}");
-        assert_eq!(share(&(at * DMat4::from_rotation_y(3.0))), 1.0);
+        assert_eq!(share(&view, &(at * DMat4::from_rotation_y(3.0))), 1.0);
+        // Within the object, at its centre, a camera sees as well.
+        let view = Place { world_from_camera: DMat4::IDENTITY, ..view };
+        assert!(view.seen_by(&DMat4::IDENTITY, pixel_grid(SIDE, SIDE, 1)).iter().all(|colour| (colour + 0.5).abs() < 1e-6));
     }
 }
