@@ -498,10 +498,10 @@ fn masks_are_tried_dilated() {
             [&known, &beside].map(|found| found.ranking.iter().map(|ranked| ranked.phases).collect::<Vec<_>>()),
             [[3, 3]; 2]
         );
-        let without = [(0, 1, 6), (0, 1, 6), (1, 1, 6)];
+        let without = [(0, 1, 6), (1, 1, 6)];
         // Nearly a shadow: a closer look takes two steps more.
         let closer = [(2, 5, 6), (3, 5, 6), (4, 5, 6)];
-        let with = [[(0, 3, 6), (0, 3, 17), (1, 3, 17), (2, 3, 17)].as_slice(), &closer, &[(4, 5, 6), (5, 5, 6)]].concat();
+        let with = [[(0, 3, 17), (1, 3, 17), (2, 3, 17)].as_slice(), &closer, &[(4, 5, 6), (5, 5, 6)]].concat();
         assert_eq!(steps, [&without[..], &with].concat());
 
         // What is known of the outline already, as from another frame, holds from the beginning; where dilations are tried, they are beside it.
@@ -721,7 +721,7 @@ fn rounding_does_not_part_searches() {
     let Method::Bfgs { grain, .. } = Options::default().method else { unreachable!("the default is BFGS") };
     let (ours, without) = (together(grain), together(0.0));
     println!("{ours} of 24 end together, with steps of any length {without}");
-    assert!(ours >= 18 && without <= 12, "{ours} {without}");
+    assert!(ours >= 18 && without <= ours - 4, "{ours} {without}");
 }
 
 /// Where neither the picture nor the view shows anything, no rays are cast: the loss is that of the whole picture all the same, and hypotheses that show

@@ -488,9 +488,6 @@ pub(crate) fn check(model: &Model, queries: &[Query], options: &Options) -> Resu
     if options.phases.is_empty() {
         return setting("phases", "there are none");
     }
-    if options.align && options.first_look().is_none() {
-        return setting("align", "starts are moved in a first look: the first phase needs BFGS and no steps");
-    }
     for phase in &options.phases {
         if phase.stride == 0 || phase.keep == 0 {
             return setting("phases", "stride and keep must be at least 1");

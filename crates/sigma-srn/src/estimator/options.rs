@@ -40,7 +40,7 @@ pub struct Options {
     /// Where an image has fewer starts than this, six more are tried around each, turned by 40° about the object: to either side about each
     /// axis of the camera.
     pub min_starts: usize,
-    /// Whether the first phase, which has to be a look at all starts without steps, moves them, where [`Query::coverage`](crate::Query::coverage) is known: nearer or farther away, and turned about
+    /// Whether a first phase that only looks at all starts, without steps, moves them first, where [`Query::coverage`](crate::Query::coverage) is known: nearer or farther away, and turned about
     /// themselves, until the object is as large and at the same place in the views from there as in the image; where a part of it is hidden, or as the whole of it would be, whichever has the
     /// lower loss. Else their distance and aim are taken for known.
     pub align: bool,
