@@ -9,6 +9,7 @@ use glam::{DMat4, DQuat, DVec3};
 use serde_json::Value;
 use sigma_srn::camera::pose_error;
 use sigma_srn::{Calibration, Metadata, Model, ModelConfig, Seen};
+use srn_data::{Instance, SrnSet};
 use tempfile::TempDir;
 
 const TEST: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/dataset/test");
@@ -387,6 +388,37 @@ fn records_are_written_once() {
     assert_eq!(lines.matches("DO NOT TRUST").count(), 2);
 }
 
+/// Pictures whose poses are trusted become a data set, each as it was compared.
+#[test]
+fn what_was_found_becomes_views() {
+    let home = home();
+    let dir = home.path();
+    let [seat, bucket] = ["seat", "bucket"].map(|object| format!("DATA/{object}/rgb/000004.png"));
+    let args = format!(
+        "estimate {seat} {bucket} {seat} --model model.safetensors --executor cpu --steps 2 --effort fast --save-views found"
+    );
+    let report = json(&run(dir, &format!("{args} --accept 1e9 --json"), 0));
+    let set = SrnSet::open(dir.join("found")).unwrap().load(16).unwrap();
+    let names = |instance: &Instance| instance.views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
+    assert_eq!(set.instances.iter().map(|i| &*i.name).collect::<Vec<_>>(), ["bucket", "seat"]);
+    assert_eq!(
+        set.instances.iter().map(names).collect::<Vec<_>>(),
+        [vec!["bucket-000004"], vec!["seat-000004", "seat-000004-again"]]
+    );
+    let truth = SrnSet::open(Path::new(TEST).join("seat")).unwrap().load(16).unwrap();
+    let (view, original) = (&set.instances[1].views[0], &truth.instances[0].views[4]);
+    let rows = matrix(&report["images"][0]["world_from_camera"]).transpose().to_cols_array();
+    assert_eq!((view.world_from_camera, view.intrinsics), (rows, original.intrinsics));
+    let off = view.rgb.iter().zip(&original.rgb).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(off <= 1.001 / 255.0, "{off}");
+
+    fail(dir, &args, &["found", "seat", "exists"]);
+    // What is not trusted is not believed; what was there stays.
+    run(dir, &format!("{args} --accept 1e-9 --force"), 1);
+    assert_eq!(SrnSet::open(dir.join("found")).unwrap().load(16).unwrap(), set);
+    fail(dir, &format!("{} --unseen", args.replace(&bucket, "").replace("--steps 2 --effort fast", "")), &["--save-views"]);
+}
+
 /// Of more pictures than are searched for side by side, each has its own line, instance, truth and record.
 #[test]
 fn many_pictures_come_one_after_the_other() {
@@ -588,7 +620,7 @@ fn render_makes_pictures_animations_and_folders() {
 
     // A folder is an instance: its intrinsics and poses are those of the pictures.
     render("--out orbit --orbit 3 --elevation 10");
-    let views = srn_data::SrnSet::open(dir.join("orbit")).unwrap().load(16).unwrap().instances.remove(0).views;
+    let views = SrnSet::open(dir.join("orbit")).unwrap().load(16).unwrap().instances.remove(0).views;
     assert_eq!(views.len(), 3);
     let rows = views[1].world_from_camera;
     assert!((rows[11] - 1.3 * 10f64.to_radians().sin()).abs() < 1e-6, "height {}", rows[11]);
@@ -723,6 +755,12 @@ fn a_mask_takes_pixels_out_of_the_search() {
     };
     let [plain, other] = ["0156.png", "other/0156.png"].map(|image| found(image, "--mask masks --record pictures --force"));
     assert_eq!(plain, other);
+    // Nor does it get into what is learnt from the picture.
+    let saved = ["0156.png", "other/0156.png"].map(|image| {
+        found(image, "--mask masks --save-views found --force");
+        image::open(dir.join("found/seat/rgb/seat-0156.png")).unwrap().into_rgb8()
+    });
+    assert!(saved[0] == saved[1] && saved[0].pixels().all(|pixel| pixel.0 != [255, 0, 255]));
     assert_ne!(found("0156.png", ""), found("other/0156.png", ""), "without a mask all counts");
     assert_ne!(plain, found("0156.png", ""));
     // What is cut out may be in other light; of a whole picture nobody knows what is the object.

@@ -347,6 +347,28 @@ fn adapt_fits_codes_then_networks() {
     fail(&format!("{adapt} {other} --views 1000"), &["--views 1000", "seat"]);
     assert!(!at("other").exists());
     assert!(succeed(&format!("{adapt} {other} --view 000003")).contains("seat"));
+
+    // All views of another folder of the object are fitted to, too: two and they, as one folder of all of them.
+    let views = |to: &str, names: &[&str]| {
+        for file in
+            names.iter().flat_map(|name| [format!("rgb/{name}.png"), format!("pose/{name}.txt")]).chain(["intrinsics.txt".into()])
+        {
+            fs::create_dir_all(at(to).join(&file).parent().unwrap()).unwrap();
+            fs::copy(format!("{TEST}/seat/{file}"), at(to).join(&file)).unwrap();
+        }
+        at(to).display().to_string()
+    };
+    let (few, rest) = (views("two/seat", &["000001", "000009"]), views("rest/seat", &["000012", "000015", "000018"]));
+    let all = views("all/seat", &["000001", "000009", "000012", "000015", "000018"]);
+    let of = |data: &str, out: &str, more: &str| {
+        let args = adapt.replace(&format!("{TEST}/seat"), data);
+        let text = succeed(&format!("{args} {} {more}", at(out).display()));
+        (Model::load(&at(out)).unwrap().parameters, text)
+    };
+    assert_eq!(of(&few, "apart", &format!("--more {rest}")).0, of(&all, "together", "--views 5").0);
+    let chicken = format!("{TEST}/chicken");
+    fail(&format!("{adapt} {} --more {chicken}", at("no").display()), &["--more", "`chicken`", "--data"]);
+    fail(&format!("{adapt} {} --more {}", at("no").display(), at("nothing").display()), &["nothing"]);
 }
 
 #[test]

@@ -381,8 +381,8 @@ impl InstanceWriter {
         Ok(writer)
     }
 
-    /// The same without intrinsics.
-    pub(crate) fn bare(dir: impl Into<PathBuf>, replace: bool) -> Result<Self> {
+    /// The same without intrinsics of all views.
+    pub fn bare(dir: impl Into<PathBuf>, replace: bool) -> Result<Self> {
         let dir = dir.into();
         if dir.exists() && !replace {
             return Err(Error::Exists { path: dir });
@@ -434,7 +434,7 @@ impl InstanceWriter {
     }
 
     /// Writes the intrinsics of one view.
-    pub(crate) fn view_intrinsics(&self, view: &str, intrinsics: &Intrinsics) -> Result<()> {
+    pub fn view_intrinsics(&self, view: &str, intrinsics: &Intrinsics) -> Result<()> {
         let folder = self.new.join("intrinsics");
         std::fs::create_dir_all(&folder).at(&folder)?;
         let path = folder.join(format!("{view}.txt"));

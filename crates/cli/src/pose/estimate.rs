@@ -15,6 +15,7 @@ use super::mask::MadeRight;
 use super::notation::{Notation, NotationArgs, ObjectPose};
 use super::outline;
 use super::record::Log;
+use super::saved::SavedViews;
 use super::search::{On, PoseError, SearchArgs, Starts, deviation, run as search, within_95};
 use crate::common::{EngineArgs, Result, about_model, create_dir, load_model, lossy, print, refuse_existing, refuse_to_write};
 use crate::progress;
@@ -33,7 +34,7 @@ pub struct Estimate {
     object: ObjectArgs,
     /// An experiment. The object is none of the model's, but of their kind: a latent code is fitted to each picture together with the pose, beginning with
     /// those of the objects that look most alike.
-    #[arg(long, conflicts_with_all = ["instance", "record", "preset", "effort", "loss", "steps", "lr", "cull", "no_cull", "stride"])]
+    #[arg(long, conflicts_with_all = ["instance", "record", "save_views", "preset", "effort", "loss", "steps", "lr", "cull", "no_cull", "stride"])]
     unseen: bool,
     /// With --unseen and one picture: write the model with this object, for further pictures of it.
     #[arg(long, value_name = "FILE")]
@@ -64,7 +65,10 @@ pub struct Estimate {
     /// Write to this folder, of each search, a picture, an animation, and the found object's outline on the picture as it was given.
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
-    /// Overwrite pictures in the folder of --record, and the file of --save-model.
+    /// Write the pictures whose poses are trusted to this folder, as views of a data set that is as the model's was: for `sigma-train adapt --more`.
+    #[arg(long, value_name = "DIR")]
+    save_views: Option<PathBuf>,
+    /// Overwrite pictures in the folder of --record, the file of --save-model, and objects in the folder of --save-views.
     #[arg(long)]
     force: bool,
     #[command(flatten)]
@@ -187,10 +191,11 @@ pub fn run(args: &Estimate) -> Result<bool> {
         }
         refuse_to_write(path, args.force)?;
     }
+    let saved = args.save_views.as_ref().map(|dir| SavedViews::create(dir, &model, &pictures, args.force)).transpose()?;
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
     let mut output = Output { args, on, notation: &notation, pictures: &pictures, sources: &sources, images: vec![] };
-    let done = if args.unseen { unseen(&starts, &mut output) } else { searched(&starts, &mut output) };
+    let done = if args.unseen { unseen(&starts, &mut output) } else { searched(&starts, saved, &mut output) };
     // Poses that were found are told, also where a picture of them could not be written.
     if done.is_err() && output.images.is_empty() {
         return done.map(|()| false);
@@ -200,7 +205,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
 }
 
 /// Poses of pictures of objects in the model.
-fn searched(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
+fn searched(starts: &[Vec<DMat4>], mut saved: Option<SavedViews>, output: &mut Output) -> Result<()> {
     let &mut Output { args, on, pictures, .. } = output;
     let settings = args.search.search()?;
     let bar = progress::bar(0, "steps");
@@ -220,6 +225,7 @@ fn searched(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
         for (picture, found) in pictures.iter().zip(&found) {
             let starts = found.estimate.ranking.len();
             output.add(on.model.instance_name(picture.instance), found, starts, &bar)?;
+            saved.iter_mut().try_for_each(|saved| saved.add(picture, found, on.side))?;
         }
         if let Some(dir) = &args.record {
             for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
@@ -231,6 +237,9 @@ fn searched(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
     bar.finish_and_clear();
     if let Some(dir) = &args.record {
         eprintln!("pictures in {}", dir.display());
+    }
+    if let (Some(saved), Some(dir)) = (saved, &args.save_views) {
+        eprintln!("{} of {} pictures are views in {}", saved.finish()?, pictures.len(), dir.display());
     }
     if args.cutout.is_empty() && output.images.iter().any(|image| image.doubt == Some(Doubt::Hidden)) {
         eprintln!("--mask says nothing of what it hides; a segmentation of the object is for --cutout, and its outline counts");

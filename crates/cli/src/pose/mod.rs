@@ -12,6 +12,7 @@ mod notation;
 mod outline;
 mod record;
 pub mod render;
+mod saved;
 mod search;
 mod summary;
 mod symmetry;

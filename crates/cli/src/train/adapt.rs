@@ -1,7 +1,7 @@
 //! `sigma-train adapt`: the two-shot fit. New instances get latent codes, while the networks are frozen (spec 4); then the networks learn
 //! what no code can say.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use glam::DMat4;
@@ -9,7 +9,7 @@ use rand::RngExt;
 use serde::Serialize;
 use sigma_srn::{Engine, Model, Train, Trainer, stream};
 use srn_data::camera::uniform_sphere;
-use srn_data::{Instance, LoadedView};
+use srn_data::{Dataset, Instance, LoadedView};
 
 use super::reflection::{self, Reflection};
 use super::settings::{positive, up_to};
@@ -43,6 +43,10 @@ pub struct AdaptArgs {
     /// New instances: a folder of SRN instance folders, or one of those.
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
+    /// More views of the same instances, all of which are fitted to: pictures whose poses an adapted model has found, as `sigma-pose estimate
+    /// --save-views` writes them. Instances that are not there have none.
+    #[arg(long, value_name = "DIR")]
+    more: Option<PathBuf>,
     /// The model to write: the new instances alone.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -202,7 +206,12 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
     let side = args.side.or(model.metadata.side).ok_or("the model file names no image side; give --side")?;
     let set = common::load_set(&args.data, side)?;
     model.hypernetwork().map_err(|error| common::about_model(&args.model, error))?;
-    let split = set.instances.iter().map(|instance| split(args, instance)).collect::<Result<Vec<_>>>()?;
+    let more = args.more.as_ref().map(|dir| load_more(dir, side, &set)).transpose()?.unwrap_or_default();
+    let mut split = set.instances.iter().map(|instance| split(args, instance)).collect::<Result<Vec<_>>>()?;
+    for Instance { name, views } in &more {
+        let known = set.instances.iter().zip(&mut split).filter(|(instance, _)| instance.name == *name);
+        known.for_each(|(_, (fitted, _))| fitted.extend(views));
+    }
     let fitted: Vec<Shown> = (0..).zip(&split).flat_map(|(k, (fitted, _))| fitted.iter().map(move |&view| (k, view))).collect();
 
     let engine = args.engine.open()?;
@@ -237,6 +246,15 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
         print(&format!("model: {out}"))?;
     }
     Ok(true)
+}
+
+/// The instances of `--more`, which those of `set` are to have among them.
+fn load_more(dir: &Path, side: u32, set: &Dataset) -> Result<Vec<Instance>> {
+    let more = common::load_set(dir, side)?.instances;
+    match more.iter().find(|instance| set.instances.iter().all(|known| known.name != instance.name)) {
+        Some(unknown) => Err(format!("--more {}: instance `{}` is not in --data", dir.display(), unknown.name).into()),
+        None => Ok(more),
+    }
 }
 
 /// How well an instance came out.
