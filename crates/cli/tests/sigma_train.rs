@@ -348,24 +348,31 @@ fn adapt_fits_codes_then_networks() {
     assert!(!at("other").exists());
     assert!(succeed(&format!("{adapt} {other} --view 000003")).contains("seat"));
 
-    // All views of another folder of the object are fitted to, too: two and they, as one folder of all of them.
+    // All views of another folder of the object are fitted to, too: as if they had known poses, while the networks stay.
     let views = |to: &str, names: &[&str]| {
-        for file in
-            names.iter().flat_map(|name| [format!("rgb/{name}.png"), format!("pose/{name}.txt")]).chain(["intrinsics.txt".into()])
-        {
+        let of_view = |name: &&str| [format!("rgb/{name}.png"), format!("pose/{name}.txt")];
+        for file in names.iter().flat_map(of_view).chain(["intrinsics.txt".into()]) {
             fs::create_dir_all(at(to).join(&file).parent().unwrap()).unwrap();
             fs::copy(format!("{TEST}/seat/{file}"), at(to).join(&file)).unwrap();
         }
         at(to).display().to_string()
     };
-    let (few, rest) = (views("two/seat", &["000001", "000009"]), views("rest/seat", &["000012", "000015", "000018"]));
-    let all = views("all/seat", &["000001", "000009", "000012", "000015", "000018"]);
+    let (few, rest) = (views("two/seat", &["000001", "000009"]), views("rest/seat", &["000012", "000015"]));
+    let all = views("all/seat", &["000001", "000009", "000012", "000015"]);
     let of = |data: &str, out: &str, more: &str| {
         let args = adapt.replace(&format!("{TEST}/seat"), data);
-        let text = succeed(&format!("{args} {} {more}", at(out).display()));
-        (Model::load(&at(out)).unwrap().parameters, text)
+        let args = if more.contains("network") { args.replace("--network-steps 0", "") } else { args };
+        let result: Value = serde_json::from_str(&succeed(&format!("{args} {} {more} --json", at(out).display()))).unwrap();
+        (Model::load(&at(out)).unwrap().parameters, result["more"].clone())
     };
-    assert_eq!(of(&few, "apart", &format!("--more {rest}")).0, of(&all, "together", "--views 5").0);
+    let (apart, still) = of(&few, "apart", &format!("--more {rest}"));
+    let (together, none) = of(&all, "together", "--views 4");
+    assert_eq!((apart, &none), (together, &serde_json::json!([])));
+    let moved = |more: &Value| [0, 1].map(|k| more[k]["moved_deg"].as_f64().unwrap());
+    assert!(moved(&still).iter().all(|degrees| *degrees < 0.01), "{still}");
+    // Their poses descend with the networks.
+    let (_, descended) = of(&few, "descended", &format!("--more {rest} --network-steps 20"));
+    assert_eq!((&descended[1]["view"], moved(&descended).map(|degrees| degrees > 0.01)), (&"000015".into(), [true; 2]));
     let chicken = format!("{TEST}/chicken");
     fail(&format!("{adapt} {} --more {chicken}", at("no").display()), &["--more", "`chicken`", "--data"]);
     fail(&format!("{adapt} {} --more {}", at("no").display(), at("nothing").display()), &["nothing"]);

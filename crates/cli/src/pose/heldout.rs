@@ -39,7 +39,7 @@ impl Heldout {
             .zip(&self.set.instances)
             .flat_map(|(i, instance)| split(instance).0.into_iter().map(move |view| (i, view)))
             .collect();
-        Ok(fit.run(engine, model, names, &shown, self.side)?.0)
+        Ok(fit.run(engine, model, names, &shown, &[], self.side)?.model)
     }
 
     /// At most so many of each object's other views.

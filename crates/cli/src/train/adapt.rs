@@ -1,7 +1,7 @@
 //! `sigma-train adapt`: the two-shot fit. New instances get latent codes, while the networks are frozen (spec 4); then the networks learn
 //! what no code can say.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
 use glam::DMat4;
@@ -9,8 +9,9 @@ use rand::RngExt;
 use serde::Serialize;
 use sigma_srn::{Engine, Model, Train, Trainer, stream};
 use srn_data::camera::uniform_sphere;
-use srn_data::{Dataset, Instance, LoadedView};
+use srn_data::{Instance, LoadedView};
 
+use super::found::{self, Moved};
 use super::reflection::{self, Reflection};
 use super::settings::{positive, up_to};
 use super::{Shown, psnr_of_each, render, training_batch};
@@ -31,6 +32,8 @@ const NETWORK_RAYS: u32 = 128;
 /// Views of known objects that the networks are held to, and how many of them in a step.
 const KNOWN: usize = 64;
 const KNOWN_IN_STEP: usize = 16;
+/// Steps of the networks from one descent of poses that were found to the next: fitted less often, networks have learnt the wrong ones in between.
+const DESCENT_EVERY: u64 = 5;
 /// Part of the networks' rays that is drawn where a picture is not of one colour.
 const DETAIL: f64 = 0.5;
 
@@ -43,8 +46,8 @@ pub struct AdaptArgs {
     /// New instances: a folder of SRN instance folders, or one of those.
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
-    /// More views of the same instances, all of which are fitted to: pictures whose poses an adapted model has found, as `sigma-pose estimate
-    /// --save-views` writes them. Instances that are not there have none.
+    /// More views of these instances, with poses that the adapted model has found, as `sigma-pose estimate --save-views` writes them. All are
+    /// fitted to, and their poses along with the networks.
     #[arg(long, value_name = "DIR")]
     more: Option<PathBuf>,
     /// The model to write: the new instances alone.
@@ -107,25 +110,42 @@ impl Default for Fit {
     }
 }
 
+/// What a fit ends with.
+pub struct Fitted {
+    /// With the new instances alone.
+    pub model: Model,
+    /// Of each instance, as far as it was asked for them.
+    reflections: Vec<Vec<Reflection>>,
+    /// The views whose poses were fitted, where they are now.
+    more: Vec<(u32, LoadedView)>,
+}
+
+fn borrowed(views: &[(u32, LoadedView)]) -> Vec<Shown<'_>> {
+    views.iter().map(|(instance, view)| (*instance, view)).collect()
+}
+
 impl Fit {
     /// As in the paper: the networks stay.
     pub const fn of_codes(self) -> Self {
         Fit { network_steps: 0, ..self }
     }
 
-    /// The trained model with these instances instead of its own, fitted to views of them, and each one's reflections, as far as it was
-    /// asked for them.
+    /// The trained model with these instances instead of its own, fitted to views of them, and to `more`, whose poses are fitted, too.
     pub fn run(
         &self,
         engine: &Engine,
         trained: &Model,
         names: Vec<String>,
         views: &[Shown],
+        more: &[Shown],
         side: u32,
-    ) -> Result<(Model, Vec<Vec<Reflection>>)> {
+    ) -> Result<Fitted> {
         let bar = progress::bar(self.steps + self.network_steps, "fitting");
         let [rays, network_rays] = [self.rays, self.network_rays].map(|rays| rays.min(side * side));
         let has_two_views = views.len() >= 2 * names.len();
+        let posed = views.len();
+        let views = [views, more].concat();
+        let mut own: Vec<(u32, LoadedView)> = views.iter().map(|&(instance, view)| (instance, view.clone())).collect();
         let model = trained.with_new_instances(names.clone())?;
         let mut trainer = Trainer::new(engine, model, Train::Codes, views.len() as u32, rays)?;
         let take = |trainer: &mut Trainer, step: u64, views: &[Shown], rays, detail, lr| -> Result<()> {
@@ -137,31 +157,35 @@ impl Fit {
             Ok(())
         };
         for step in 1..=self.steps {
-            take(&mut trainer, step, views, rays, 0.0, self.lr)?;
+            take(&mut trainer, step, &views, rays, 0.0, self.lr)?;
         }
         let fitted = trainer.model()?.clone();
         drop(trainer);
         if self.network_steps == 0 {
             bar.finish_and_clear();
-            return Ok((fitted, vec![vec![]; names.len()]));
+            return Ok(Fitted { model: fitted, reflections: vec![vec![]; names.len()], more: own.split_off(posed) });
         }
         let reflections =
-            if self.no_reflections { vec![vec![]; names.len()] } else { reflection::reflections(engine, &fitted, views, side)? };
-        let images = reflection::images(views, side, |instance| &reflections[instance as usize]);
-        let images = images.iter().map(|(instance, view)| (*instance, view));
-        let views: Vec<Shown> = views.iter().copied().chain(images).collect();
+            if self.no_reflections { vec![vec![]; names.len()] } else { reflection::reflections(engine, &fitted, &views, side)? };
+        let images_of =
+            |own: &[(u32, LoadedView)]| reflection::images(&borrowed(own), side, |instance| &reflections[instance as usize]);
+        let mut images = images_of(&own);
         // Instances: the new ones, then the known ones.
         let known = self.known(engine, trained, &views, side)?;
         let all = (0..trained.layout.instances).map(|instance| trained.instance_name(instance));
         let all = names.iter().cloned().chain(all).collect();
         let joined = trained.with_codes(all, [fitted.codes()?, trained.codes()?].concat())?;
         let shown: Vec<Shown> = known.iter().map(|(instance, view)| (names.len() as u32 + instance, view)).collect();
-        let batch = views.len() + KNOWN_IN_STEP;
+        let batch = own.len() + images.len() + KNOWN_IN_STEP;
         let mut trainer = Trainer::new(engine, joined, Train::Everything, batch as u32, network_rays)?;
         for step in 1..=self.network_steps {
             let lr = if 3 * step > 2 * self.network_steps { 0.1 * self.network_lr } else { self.network_lr };
-            let some = shown.iter().cycle().skip(step as usize * KNOWN_IN_STEP % KNOWN).take(KNOWN_IN_STEP);
-            let views: Vec<Shown> = views.iter().chain(some).copied().collect();
+            if posed < own.len() && step.is_multiple_of(DESCENT_EVERY) {
+                found::descend(engine, trainer.model()?, &mut own[posed..], side)?;
+                images = images_of(&own);
+            }
+            let some = shown.iter().copied().cycle().skip(step as usize * KNOWN_IN_STEP % KNOWN).take(KNOWN_IN_STEP);
+            let views: Vec<Shown> = borrowed(&own).into_iter().chain(borrowed(&images)).chain(some).collect();
             take(&mut trainer, self.steps + step, &views, network_rays, DETAIL, lr)?;
         }
         bar.finish_and_clear();
@@ -171,7 +195,7 @@ impl Fit {
         // Of objects that are known from fewer views, or by less of a fit, it says nothing.
         let is_as_calibrated = self.network_steps >= NETWORK_STEPS && self.steps >= STEPS && has_two_views;
         model.metadata.calibration = model.metadata.calibration_of_new.take().filter(|_| is_as_calibrated);
-        Ok((model, reflections))
+        Ok(Fitted { model, reflections, more: own.split_off(posed) })
     }
 
     /// Views of the trained model's own instances, drawn at random, from as far away as it was trained, through the first view's lens.
@@ -187,8 +211,7 @@ impl Fit {
             (random.random_range(0..trained.layout.instances), view)
         };
         let mut known: Vec<_> = uniform_sphere(KNOWN, radius, self.seed).into_iter().map(view).collect();
-        let shown: Vec<Shown> = known.iter().map(|(instance, view)| (*instance, view)).collect();
-        let rendering = render(engine, trained, &shown, side)?;
+        let rendering = render(engine, trained, &borrowed(&known), side)?;
         let pictures = rendering.rgb.chunks_exact(3 * (side * side) as usize);
         known.iter_mut().zip(pictures).for_each(|((_, view), rgb)| view.rgb = rgb.to_vec());
         Ok(known)
@@ -206,17 +229,21 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
     let side = args.side.or(model.metadata.side).ok_or("the model file names no image side; give --side")?;
     let set = common::load_set(&args.data, side)?;
     model.hypernetwork().map_err(|error| common::about_model(&args.model, error))?;
-    let more = args.more.as_ref().map(|dir| load_more(dir, side, &set)).transpose()?.unwrap_or_default();
-    let mut split = set.instances.iter().map(|instance| split(args, instance)).collect::<Result<Vec<_>>>()?;
-    for Instance { name, views } in &more {
-        let known = set.instances.iter().zip(&mut split).filter(|(instance, _)| instance.name == *name);
-        known.for_each(|(_, (fitted, _))| fitted.extend(views));
-    }
+    let split = set.instances.iter().map(|instance| split(args, instance)).collect::<Result<Vec<_>>>()?;
     let fitted: Vec<Shown> = (0..).zip(&split).flat_map(|(k, (fitted, _))| fitted.iter().map(move |&view| (k, view))).collect();
+
+    let found = args.more.as_ref().map(|dir| common::load_set(dir, side)).transpose()?.map_or(vec![], |set| set.instances);
+    let mut more: Vec<Shown> = vec![];
+    for Instance { name, views } in &found {
+        let Some((number, _)) = (0..).zip(&set.instances).find(|(_, instance)| instance.name == *name) else {
+            return Err(format!("--more: instance `{name}` is not in --data {}", args.data.display()).into());
+        };
+        more.extend(views.iter().map(|view| (number, view)));
+    }
 
     let engine = args.engine.open()?;
     let names = set.instances.iter().map(|instance| instance.name.clone()).collect();
-    let (model, reflections) = args.fit.run(&engine, &model, names, &fitted, side)?;
+    let Fitted { model, reflections, more: moved } = args.fit.run(&engine, &model, names, &fitted, &more, side)?;
     let mut results = vec![];
     for (instance, (fitted, unseen)) in (0..).zip(&split) {
         let views: Vec<Shown> = fitted.iter().chain(unseen).map(|&view| (instance, view)).collect();
@@ -224,17 +251,25 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
         let (fitted, unseen) = psnr.split_at(fitted.len());
         let name = model.instance_name(instance);
         let reflections = reflections[instance as usize].iter().map(|reflection| reflection.name).collect();
-        results.push(Fitted { instance: name, fitted_psnr: mean(fitted), unseen_psnr: mean(unseen), reflections });
+        results.push(Outcome { instance: name, fitted_psnr: mean(fitted), unseen_psnr: mean(unseen), reflections });
     }
+    let moved = more
+        .iter()
+        .zip(&moved)
+        .map(|((instance, before), (_, after))| Moved::between(model.instance_name(*instance), before, after));
+    let moved: Vec<Moved> = moved.collect();
     model.save(&args.out)?;
     if args.json {
-        print(&format!("{:#}", serde_json::json!({ "model": args.out, "instances": results })))?;
+        print(&format!("{:#}", serde_json::json!({ "model": args.out, "instances": results, "more": moved })))?;
     } else {
         print(&format!("{:<24} {:>14} {:>14}  reflections", "instance", "fitted views", "unseen views"))?;
-        for Fitted { instance, fitted_psnr, unseen_psnr, reflections } in &results {
+        for Outcome { instance, fitted_psnr, unseen_psnr, reflections } in &results {
             let [fitted, unseen] = [fitted_psnr, unseen_psnr].map(|psnr| psnr.map_or("-".into(), |psnr| format!("{psnr:.2} dB")));
             let reflections = if reflections.is_empty() { "-".into() } else { reflections.join(" ") };
             print(&format!("{instance:<24} {fitted:>14} {unseen:>14}  {reflections}"))?;
+        }
+        if let Some(degrees) = mean(&moved.iter().map(|moved| moved.moved_deg).collect::<Vec<_>>()) {
+            print(&format!("poses of --more, {} of them, were moved by {degrees:.2}° in the mean", moved.len()))?;
         }
         let deviations = match model.metadata.calibration {
             Some(_) => "stated, as learnt from other new objects",
@@ -248,18 +283,9 @@ pub fn adapt(args: &AdaptArgs) -> Result<bool> {
     Ok(true)
 }
 
-/// The instances of `--more`, which those of `set` are to have among them.
-fn load_more(dir: &Path, side: u32, set: &Dataset) -> Result<Vec<Instance>> {
-    let more = common::load_set(dir, side)?.instances;
-    match more.iter().find(|instance| set.instances.iter().all(|known| known.name != instance.name)) {
-        Some(unknown) => Err(format!("--more {}: instance `{}` is not in --data", dir.display(), unknown.name).into()),
-        None => Ok(more),
-    }
-}
-
 /// How well an instance came out.
 #[derive(Serialize)]
-struct Fitted {
+struct Outcome {
     instance: String,
     fitted_psnr: Option<f64>,
     /// None if there are no other views than the fitted ones.

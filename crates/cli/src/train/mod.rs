@@ -2,6 +2,7 @@
 
 pub mod adapt;
 pub mod fit;
+mod found;
 mod reflection;
 mod settings;
 pub mod torch;
