@@ -239,7 +239,8 @@ fn searched(starts: &[Vec<DMat4>], mut saved: Option<SavedViews>, output: &mut O
         eprintln!("pictures in {}", dir.display());
     }
     if let (Some(saved), Some(dir)) = (saved, &args.save_views) {
-        eprintln!("{} of {} pictures are views in {}", saved.finish()?, pictures.len(), dir.display());
+        let written = saved.finish()?;
+        eprintln!("{written} of {} pictures, those with poses to be trusted, written to {}", pictures.len(), dir.display());
     }
     if args.cutout.is_empty() && output.images.iter().any(|image| image.doubt == Some(Doubt::Hidden)) {
         eprintln!("--mask says nothing of what it hides; a segmentation of the object is for --cutout, and its outline counts");

@@ -47,7 +47,7 @@ pub struct AdaptArgs {
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
     /// More views of these instances, with poses that the adapted model has found, as `sigma-pose estimate --save-views` writes them. All are
-    /// fitted to, and their poses along with the networks.
+    /// fitted to, and their poses along with the networks; with --network-steps 0 they stay.
     #[arg(long, value_name = "DIR")]
     more: Option<PathBuf>,
     /// The model to write: the new instances alone.
