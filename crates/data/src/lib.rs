@@ -18,6 +18,7 @@ pub mod obj;
 mod picture;
 pub mod pixels;
 pub mod ply;
+pub mod segment;
 pub mod sheet;
 pub mod srn;
 pub mod stl;

@@ -3,11 +3,21 @@
 use crate::error::{Error, Result};
 use crate::picture::read_mask;
 use crate::pixels::Pixels;
+use crate::segment::{BoundingBox, Known, object_in};
 use crate::srn::{Intrinsics, load_square};
 use std::path::Path;
 
 /// Room around the object on each side of a square that is cut around it, as a share of its extent.
 pub const MARGIN: f64 = 0.1;
+
+/// What of a photograph is the object.
+#[derive(Clone, Copy)]
+pub enum Cutout<'a> {
+    /// By a mask, white or opaque where it is.
+    Mask(&'a Path),
+    /// By a box around it, and by what is known of it; see [`crate::segment`].
+    Box(BoundingBox, Known<'a>),
+}
 
 /// A square of a picture, resampled.
 #[derive(Debug, Clone, PartialEq)]
@@ -47,19 +57,24 @@ impl Target {
     }
 
     /// Reads a photograph and cuts a square around what masks and transparency leave of it, with [`MARGIN`]; the intrinsics follow.
-    /// Pixels where the mask is black, or outside of the photograph, do not count; where the cutout is black they are white background, as transparent
-    /// ones are, and do. Without any of these it is the centre square.
+    /// Pixels where the mask is black, or outside of the photograph, do not count; what the cutout leaves out is white background, as what is
+    /// transparent is, and does. Without any of these it is the centre square.
     pub fn of_photo(
         path: &Path,
-        cutout: Option<&Path>,
+        cutout: Option<Cutout>,
         mask: Option<&Path>,
         intrinsics: &Intrinsics,
         side: usize,
     ) -> Result<Self> {
         let (mut picture, mut opacity) = Pixels::open_with_opacity(path)?;
         let size = [picture.width, picture.height];
-        if let Some(cutout) = cutout {
-            for ((colours, opacity), object) in picture.data.chunks_exact_mut(3).zip(&mut opacity).zip(counts(cutout, size)?) {
+        let object = match cutout {
+            None => None,
+            Some(Cutout::Mask(mask)) => Some(counts(mask, size)?),
+            Some(Cutout::Box(bounds, known)) => Some(object_in(&picture, bounds, known).ok_or_else(|| nothing_in(path, bounds, size))?),
+        };
+        if let Some(object) = object {
+            for ((colours, opacity), object) in picture.data.chunks_exact_mut(3).zip(&mut opacity).zip(object) {
                 colours.iter_mut().for_each(|colour| *colour = object * *colour + (1.0 - object));
                 *opacity *= object;
             }
@@ -73,7 +88,7 @@ impl Target {
         });
         let Some([low, high]) = bounds else {
             return Err(Error::field(
-                mask.or(cutout).unwrap_or(path),
+                mask.or(if let Some(Cutout::Mask(mask)) = cutout { Some(mask) } else { None }).unwrap_or(path),
                 "mask",
                 "white, or opaque, where the object is",
                 format!("nothing of it, at most {:.0} of 255", 255.0 * (0..opacity.len()).map(shown).fold(0.0, f32::max)),
@@ -108,6 +123,16 @@ impl Target {
         let coverage = Some(opaque.into_iter().step_by(3).map(|share| share.clamp(0.0, 1.0)).collect());
         Ok(Self { rgb, weights, coverage, intrinsics, cut: true, corner, extent })
     }
+}
+
+/// Of a box in which no object is seen.
+fn nothing_in(path: &Path, BoundingBox { corner: [x, y], size: [width, height] }: BoundingBox, [across, down]: [usize; 2]) -> Error {
+    Error::field(
+        path,
+        format!("box {x},{y},{width},{height}"),
+        format!("an object in its {across}×{down} pixels, and some of what is around it"),
+        "nothing that differs from what is around it, or nothing around it",
+    )
 }
 
 /// A mask as numbers from 0 to 1.
@@ -186,8 +211,8 @@ mod tests {
         let coverage = alone.coverage.as_ref().unwrap();
         assert_eq!((&coverage[..6], &coverage[12..18]), (&[0.0; 6][..], &[0.5, 1.0, 1.0, 1.0, 1.0, 0.5][..]));
         // A mask that cuts out is as good, and goes together with transparency.
-        assert_eq!(Target::of_photo(&photo, Some(&mask), None, &INTRINSICS, 6).unwrap(), alone);
-        assert_eq!(Target::of_photo(&cut, Some(&mask), None, &INTRINSICS, 6).unwrap(), alone);
+        assert_eq!(Target::of_photo(&photo, Some(Cutout::Mask(&mask)), None, &INTRINSICS, 6).unwrap(), alone);
+        assert_eq!(Target::of_photo(&cut, Some(Cutout::Mask(&mask)), None, &INTRINSICS, 6).unwrap(), alone);
         let left = GrayImage::from_fn(60, 40, |x, _| Luma([if x < 46 { 255 } else { 0 }]));
         let left = saved(dir.path(), "left.png", left);
         let both = Target::of_photo(&cut, None, Some(&left), &INTRINSICS, 6).unwrap();

@@ -2,6 +2,7 @@
 
 use std::collections::HashSet;
 use std::path::PathBuf;
+use std::rc::Rc;
 
 use clap::Args;
 use glam::DMat4;
@@ -9,8 +10,11 @@ use indicatif::ProgressBar;
 use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Light, Model, Pose6};
 use srn_data::camera::Axes;
+use srn_data::segment::{BoundingBox, Known};
+use srn_data::target::Cutout;
 
 use super::files::{Masks, ObjectArgs, Picture, PoseSource, model_side, srn_instance, warn_of_turned};
+use super::boxed::{Boxed, Outcome};
 use super::mask::MadeRight;
 use super::notation::{Notation, NotationArgs, ObjectPose};
 use super::outline;
@@ -43,6 +47,10 @@ pub struct Estimate {
     /// object's outline helps. A file, once or once per picture, or a folder with files called like the pictures.
     #[arg(long, value_name = "FILE|DIR")]
     cutout: Vec<PathBuf>,
+    /// A box around the object, as detectors give it, instead of a segmentation: left edge, top edge, width and height in pixels of the picture. What in it is the
+    /// object is found by its colours, and then by the pose that was found with these, from where the search is done once more. Once, or once per picture.
+    #[arg(long = "box", value_name = "X,Y,W,H", value_parser = bounding_box, allow_hyphen_values = true, conflicts_with_all = ["cutout", "unseen"])]
+    boxes: Vec<BoundingBox>,
     /// What counts in a picture: white, or opaque. What is black (something before the object) has no part in the search: the object may go on there.
     /// Like --cutout.
     #[arg(long, value_name = "FILE|DIR")]
@@ -174,10 +182,9 @@ pub fn run(args: &Estimate) -> Result<bool> {
     if !args.rough.is_empty() && *starts != Starts::Neighbor4 {
         return Err(format!("--rough is what --starts neighbor4 turns; {starts} does without it").into());
     }
-    let starts = |(picture, rough): (&Picture, &Option<DMat4>)| {
-        args.search.starts(starts, &model, picture, side, rough.as_ref(), &notation)
-    };
-    let starts = pictures.iter().zip(&rough).map(starts).collect::<Result<Vec<_>>>()?;
+    let starts_of =
+        |number: usize, picture: &Picture| args.search.starts(starts, &model, picture, side, rough[number].as_ref(), &notation);
+    let starts = pictures.iter().enumerate().map(|(number, picture)| starts_of(number, picture)).collect::<Result<Vec<_>>>()?;
     if let Some(dir) = &args.record {
         let of = |end: &'static str| pictures.iter().map(move |p| dir.join(format!("{}{end}", p.name)));
         let files = [".png", ".gif", "-outline.png"].into_iter().flat_map(of);
@@ -195,7 +202,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
     let mut output = Output { args, on, notation: &notation, pictures: &pictures, sources: &sources, images: vec![] };
-    let done = if args.unseen { unseen(&starts, &mut output) } else { searched(&starts, saved, &mut output) };
+    let done = if args.unseen { unseen(&starts, &mut output) } else { searched(&starts_of, saved, &mut output) };
     // Poses that were found are told, also where a picture of them could not be written.
     if done.is_err() && output.images.is_empty() {
         return done.map(|()| false);
@@ -204,15 +211,24 @@ pub fn run(args: &Estimate) -> Result<bool> {
     done.map(|()| is_trusted)
 }
 
-/// Poses of pictures of objects in the model.
-fn searched(starts: &[Vec<DMat4>], mut saved: Option<SavedViews>, output: &mut Output) -> Result<()> {
-    let &mut Output { args, on, pictures, .. } = output;
-    let settings = args.search.search()?;
+/// Poses of pictures of objects in the model; `starts_of` a picture with this number.
+fn searched(
+    starts_of: &dyn Fn(usize, &Picture) -> Result<Vec<DMat4>>,
+    mut saved: Option<SavedViews>,
+    output: &mut Output,
+) -> Result<()> {
+    let &mut Output { args, on, pictures: all, .. } = output;
+    let is_boxed = !args.boxes.is_empty();
+    let settings = if is_boxed { args.search.single(args.search.options()?) } else { args.search.search()? };
+    let open = |number: usize, known: Known| {
+        let Picture { ref name, truth, .. } = all[number];
+        Ok(Picture { name: name.clone(), truth, ..opened(args, on.model, on.side, number, known)? })
+    };
     let bar = progress::bar(0, "steps");
-    let (mut left, mut before) = (pictures.len().div_ceil(AT_ONCE) as u64, 0);
-    for (pictures, starts) in pictures.chunks(AT_ONCE).zip(starts.chunks(AT_ONCE)) {
-        let (first, mut log) = (output.images.len(), Log::default());
-        let found = search(&settings, on, pictures, starts, |mut progress| {
+    let (mut left, mut before) = (all.len().div_ceil(AT_ONCE) as u64 * if is_boxed { 2 } else { 1 }, 0);
+    let mut pass = |pictures: Vec<Picture>, starts: &[Vec<DMat4>]| -> Result<Vec<Outcome>> {
+        let mut log = Log::default();
+        let found = search(&settings, on, &pictures, starts, |mut progress| {
             bar.set_length(before + left * u64::from(progress.steps));
             if progress.search > 0 && progress.step == 0 {
                 bar.set_message(format!("{}, once more", pictures[progress.hypotheses[0].0].name));
@@ -220,17 +236,31 @@ fn searched(starts: &[Vec<DMat4>], mut saved: Option<SavedViews>, output: &mut O
             bar.set_position(before + u64::from(progress.step));
             if args.record.is_some() { log.note(&mut progress) } else { Ok(()) }
         })?;
-        (left, before) = (left - 1, bar.position());
+        // Pictures with boxes may need two more than was thought.
+        (left, before) = ((left - 1).max(1), bar.position());
         bar.set_message("");
-        for (picture, found) in pictures.iter().zip(&found) {
-            let starts = found.estimate.ranking.len();
-            output.add(on.model.instance_name(picture.instance), found, starts, &bar)?;
+        let log = Rc::new(log);
+        let outcome = |(i, (picture, found))| Outcome { picture, found, log: (log.clone(), i) };
+        Ok(pictures.into_iter().zip(found).enumerate().map(outcome).collect())
+    };
+    for first in (0..all.len()).step_by(AT_ONCE) {
+        let numbers: Vec<usize> = (first..all.len()).take(AT_ONCE).collect();
+        let pictures = all[first..][..numbers.len()].to_vec();
+        let outcomes = if is_boxed {
+            Boxed { on, open: &open, starts: starts_of }.search(&numbers, pictures, &mut pass)?
+        } else {
+            let starts = numbers.iter().zip(&pictures).map(|(&number, picture)| starts_of(number, picture));
+            let starts = starts.collect::<Result<Vec<_>>>()?;
+            pass(pictures, &starts)?
+        };
+        for Outcome { picture, found, .. } in &outcomes {
             saved.iter_mut().try_for_each(|saved| saved.add(picture, found, on.side))?;
+            output.add(picture, on.model.instance_name(picture.instance), found, found.estimate.ranking.len(), &bar)?;
         }
         if let Some(dir) = &args.record {
-            for (i, (picture, found)) in pictures.iter().zip(&found).enumerate() {
-                log.write(dir, i, picture, found, on)?;
-                outline::write(dir, &args.images[first + i], picture, found, on)?;
+            for (number, Outcome { picture, found, log: (log, i) }) in numbers.into_iter().zip(&outcomes) {
+                log.write(dir, *i, picture, found, on)?;
+                outline::write(dir, &args.images[number], picture, found, on)?;
             }
         }
     }
@@ -239,10 +269,10 @@ fn searched(starts: &[Vec<DMat4>], mut saved: Option<SavedViews>, output: &mut O
         eprintln!("pictures in {}", dir.display());
     }
     if let (Some(saved), Some(dir)) = (saved, &args.save_views) {
-        let written = saved.finish()?;
-        eprintln!("{written} of {} pictures, those with poses to be trusted, written to {}", pictures.len(), dir.display());
+        let (written, all) = (saved.finish()?, all.len());
+        eprintln!("{written} of {all} pictures, those with poses to be trusted, written to {}", dir.display());
     }
-    if args.cutout.is_empty() && output.images.iter().any(|image| image.doubt == Some(Doubt::Hidden)) {
+    if args.cutout.is_empty() && !is_boxed && output.images.iter().any(|image| image.doubt == Some(Doubt::Hidden)) {
         eprintln!("--mask says nothing of what it hides; a segmentation of the object is for --cutout, and its outline counts");
     }
     Ok(())
@@ -259,7 +289,7 @@ fn unseen(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
             Ok(())
         };
         let (found, fitted) = args.search.run_unseen(on, picture, starts, observe)?;
-        output.add("unseen".into(), &found, starts.len(), &bar)?;
+        output.add(picture, "unseen".into(), &found, starts.len(), &bar)?;
         if let Some(path) = &args.save_model {
             fitted.save(path)?;
         }
@@ -283,22 +313,42 @@ fn poses(flag: &str, sources: &[PoseSource], images: &[PathBuf], notation: &Nota
 
 fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> Result<Vec<Picture>> {
     let truths = poses("--truth", &args.truth, &args.images, notation)?;
-    let cutouts = each("--cutout", "masks", &args.cutout, &args.images)?;
-    let masks = each("--mask", "masks", &args.mask, &args.images)?;
-    // Of an object that the model does not know the number says nothing.
-    let (any, mut names, mut pictures) = (model.instance_name(0), HashSet::new(), Vec::new());
-    for (((path, cutout), (_, mask)), truth) in cutouts.into_iter().zip(masks).zip(truths) {
-        let masks = Masks { cutout: cutout.map(PathBuf::as_path), mask: mask.map(PathBuf::as_path) };
+    each("--cutout", "masks", &args.cutout, &args.images)?;
+    each("--mask", "masks", &args.mask, &args.images)?;
+    each("--box", "boxes", &args.boxes, &args.images)?;
+    let (mut names, mut pictures) = (HashSet::new(), Vec::new());
+    for (number, (path, truth)) in args.images.iter().zip(truths).enumerate() {
         warn_of_turned(path);
-        let instance = if args.unseen { Some(any.as_str()) } else { args.object.instance.as_deref() };
-        let picture = Picture::open(path, masks, model, side, instance, &args.object.camera)?;
-        let mut picture = Picture { truth, ..picture };
+        let mut picture = Picture { truth, ..opened(args, model, side, number, Known::default())? };
         while !names.insert(picture.name.clone()) {
             picture.name += "-again";
         }
         pictures.push(picture);
     }
     Ok(pictures)
+}
+
+/// A picture with what is said of it; if by a box, with what is `known` of the object in it.
+fn opened(args: &Estimate, model: &Model, side: u32, number: usize, known: Known) -> Result<Picture> {
+    fn of<T>(things: &[T], number: usize) -> Option<&T> {
+        things.get(number % things.len().max(1))
+    }
+    let segmentation = of(&args.cutout, number).map(|mask| Cutout::Mask(mask));
+    let cutout = segmentation.or(of(&args.boxes, number).map(|&bounds| Cutout::Box(bounds, known)));
+    let masks = Masks { cutout, mask: of(&args.mask, number).map(PathBuf::as_path) };
+    // Of an object that the model does not know the number says nothing.
+    let any = args.unseen.then(|| model.instance_name(0));
+    let instance = any.as_deref().or(args.object.instance.as_deref());
+    Picture::open(&args.images[number], masks, model, side, instance, &args.object.camera)
+}
+
+/// The value of --box.
+fn bounding_box(text: &str) -> std::result::Result<BoundingBox, String> {
+    let numbers: Vec<f64> = text.split(',').filter_map(|number| number.trim().parse().ok()).filter(|n: &f64| n.is_finite()).collect();
+    match (&numbers[..], text.matches(',').count()) {
+        (&[x, y, width, height], 3) if width > 0.0 && height > 0.0 => Ok(BoundingBox { corner: [x, y], size: [width, height] }),
+        _ => Err("expected left edge, top edge, width and height in pixels: `120,80,200,160`".into()),
+    }
 }
 
 /// What was found so far.
@@ -313,8 +363,8 @@ struct Output<'a> {
 
 impl Output<'_> {
     /// Takes what was found of the next picture, and prints it, unless all is to be one JSON document.
-    fn add(&mut self, instance: String, found: &Found, starts: usize, bar: &ProgressBar) -> Result<()> {
-        let image = self.image(instance, found);
+    fn add(&mut self, picture: &Picture, instance: String, found: &Found, starts: usize, bar: &ProgressBar) -> Result<()> {
+        let image = self.image(picture, instance, found);
         if !self.args.json {
             bar.suspend(|| print(&image.line(found, starts, self.notation)))?;
         }
@@ -337,9 +387,8 @@ impl Output<'_> {
         Ok(is_trusted)
     }
 
-    fn image(&self, instance: String, found: &Found) -> ImageReport {
+    fn image(&self, picture: &Picture, instance: String, found: &Found) -> ImageReport {
         let (k, convention) = (self.images.len(), self.args.poses.convention);
-        let picture = &self.pictures[k];
         let world_from_camera = convention.of_ours(found.world_from_camera);
         let [a, b, c, x, y, z] = Pose6::from_matrix(&world_from_camera).0;
         let error = |pose: &DMat4| picture.truth.map(|truth| PoseError::of(pose, &truth));

@@ -11,7 +11,7 @@ use image::{Delay, Frame, RgbImage};
 use sigma_srn::{Intrinsics, Model, Outline, write_atomically};
 use srn_data::formats::mask_in;
 use srn_data::srn::{self, picture_size};
-use srn_data::target::{MARGIN, Target};
+use srn_data::target::{Cutout, MARGIN, Target};
 
 use super::notation::Notation;
 use super::positive;
@@ -39,10 +39,10 @@ pub struct ObjectArgs {
 }
 
 /// Masks of a picture: files, or folders with files called like the picture.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Default)]
 pub struct Masks<'a> {
-    /// What is black there is background, as if it were transparent.
-    pub cutout: Option<&'a Path>,
+    /// What it leaves out is background, as if it were transparent.
+    pub cutout: Option<Cutout<'a>>,
     /// What is black there does not count.
     pub mask: Option<&'a Path>,
 }
@@ -181,10 +181,12 @@ impl Picture {
         let folder = dir.as_deref().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
         let instance = instance_of(model, instance.or(folder.as_deref())).map_err(|error| about(&error.to_string()))?;
         let file = |mask: Option<&Path>| mask.map(|mask| mask_of(mask, path)).transpose();
-        let (cutout, mask) = (file(masks.cutout)?, file(masks.mask)?);
-        let target = match (&dir, &cutout) {
+        let mask = file(masks.mask)?;
+        let segmentation = file(if let Some(Cutout::Mask(mask)) = masks.cutout { Some(mask) } else { None })?;
+        let cutout = segmentation.as_deref().map(Cutout::Mask).or(masks.cutout);
+        let target = match (&dir, cutout) {
             (Some(_), None) => Target::of_view(path, mask.as_deref(), &intrinsics, side as usize)?,
-            _ => Target::of_photo(path, cutout.as_deref(), mask.as_deref(), &intrinsics, side as usize)?,
+            _ => Target::of_photo(path, cutout, mask.as_deref(), &intrinsics, side as usize)?,
         };
         if target.rgb.iter().all(|&colour| colour >= WHITE) {
             return Err(about("nothing but white: no object is in it").into());

@@ -1,6 +1,7 @@
 //! `sigma-pose`: poses of pictures, the paper's protocol on a data set, novel views.
 
 pub mod bake;
+mod boxed;
 pub mod calibrate;
 mod draw;
 pub mod estimate;

@@ -13,7 +13,7 @@ use crate::common::{Result, write_picture};
 
 /// Colour of the line; its rim is black.
 const LINE: Colour = [60, 255, 90];
-/// The view is rendered at most at this many times the side that the model takes.
+/// For a line the view is rendered at most at this many times the side that the model takes.
 const FINEST: usize = 4;
 /// It shows this many times the square's width: an object of which only a part counts reaches out of its square.
 const WIDER: usize = 2;
@@ -22,28 +22,41 @@ const LEAST_HEIGHT: u32 = 320;
 
 /// Writes `NAME-outline.png` of the picture at `path` to `dir`.
 pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, on: On) -> Result<()> {
-    let side = on.side;
-    let (corner, extent) = picture.square;
-    let times = extent.div_ceil(side as usize).clamp(1, FINEST) as u32;
-    let (k, before) = (f64::from(times), 0.5 * (WIDER - 1) as f64 * f64::from(side));
-    let Intrinsics { fx, fy, cx, cy, pixel_center } = picture.intrinsics;
-    // Edges of pixels stay where they are, half a pixel before the centres.
-    let [cx, cy] = [cx, cy].map(|c| k * (c + before + 0.5) - 0.5);
-    let view_side = WIDER as u32 * times * side;
-    let camera = Intrinsics { fx: k * fx, fy: k * fy, cx, cy, pixel_center };
-    let view = &render(On { side: view_side, ..on }, &[(picture.instance, found.world_from_camera, camera)])?[0];
-    let silhouette = Silhouette::of(&view.rgb, view_side as usize);
-
+    let object = FoundObject::of(picture, found, on, FINEST)?;
     let photo = Pixels::open(path)?.to_rgb8();
     let factor = LEAST_HEIGHT.div_ceil(photo.height());
     let mut page = sheet::enlarge(&photo, factor);
-    let inside = |[x, y]: [i64; 2]| {
-        let place = [(x, corner[0]), (y, corner[1])];
-        let in_square = place.map(|(x, first)| ((x as f64 + 0.5) / f64::from(factor) - first as f64) / extent as f64);
-        silhouette.covers(in_square.map(|x| (x - 0.5) / WIDER as f64 + 0.5))
-    };
-    draw(&mut page, inside);
+    draw(&mut page, |at| object.covers(at.map(|x| (x as f64 + 0.5) / f64::from(factor))));
     write_picture(&dir.join(format!("{}-outline.png", picture.name)), &page)
+}
+
+/// Where the model shows the found object in the picture as it is on disk.
+pub struct FoundObject {
+    silhouette: Silhouette,
+    square: ([i64; 2], usize),
+}
+
+impl FoundObject {
+    /// By a view at most so many times as fine as the model's own.
+    pub fn of(picture: &Picture, found: &Found, on: On, finest: usize) -> Result<Self> {
+        let side = on.side;
+        let times = picture.square.1.div_ceil(side as usize).clamp(1, finest) as u32;
+        let (k, before) = (f64::from(times), 0.5 * (WIDER - 1) as f64 * f64::from(side));
+        let Intrinsics { fx, fy, cx, cy, pixel_center } = picture.intrinsics;
+        // Edges of pixels stay where they are, half a pixel before the centres.
+        let [cx, cy] = [cx, cy].map(|c| k * (c + before + 0.5) - 0.5);
+        let view_side = WIDER as u32 * times * side;
+        let camera = Intrinsics { fx: k * fx, fy: k * fy, cx, cy, pixel_center };
+        let view = &render(On { side: view_side, ..on }, &[(picture.instance, found.world_from_camera, camera)])?[0];
+        Ok(FoundObject { silhouette: Silhouette::of(&view.rgb, view_side as usize), square: picture.square })
+    }
+
+    /// Whether it covers a place, in pixels; their edges are whole numbers.
+    pub fn covers(&self, at: [f64; 2]) -> bool {
+        let (corner, extent) = self.square;
+        let in_square = [0, 1].map(|k| (at[k] - corner[k] as f64) / extent as f64);
+        self.silhouette.covers(in_square.map(|x| (x - 0.5) / WIDER as f64 + 0.5))
+    }
 }
 
 /// Where a view shows the object.

@@ -9,6 +9,7 @@ use indicatif::ProgressBar;
 use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Tracked, Tracker};
 use srn_data::pixels::{ENDINGS, is_picture};
+use srn_data::target::Cutout;
 
 use super::draw;
 use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side, warn_of_turned};
@@ -115,7 +116,7 @@ pub fn run(args: &Track) -> Result<bool> {
     let (mut errors, mut searches, mut trusted, mut count) = (Vec::new(), 0, true, 0);
     for path in std::iter::once(Ok(first)).chain(frames) {
         let path = path?;
-        let masks = Masks { cutout: args.cutout.as_deref(), mask: args.mask.as_deref() };
+        let masks = Masks { cutout: args.cutout.as_deref().map(Cutout::Mask), mask: args.mask.as_deref() };
         let picture = Picture::open(&path, masks, &model, side, args.object.instance.as_deref(), &args.object.camera);
         let name = |number| model.instance_name(number);
         let picture = picture.and_then(|picture| match followed {

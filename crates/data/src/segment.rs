@@ -1,0 +1,311 @@
+//! What of a picture is the object, by a box around it, as detectors give one: colours of the object and of what surrounds it, in turns with the outline that
+//! parts them best (GrabCut, Rother et al. 2004, with its cut through a graph as one through the plane: Chan, Esedoglu and Nikolova 2006).
+
+use glam::{DMat3, DVec3};
+use image::imageops;
+use image::{ImageBuffer, Luma};
+
+use crate::pixels::Pixels;
+
+/// A rectangle in a picture, in pixels; their edges are whole numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BoundingBox {
+    /// Left edge and top edge.
+    pub corner: [f64; 2],
+    /// Width and height.
+    pub size: [f64; 2],
+}
+
+/// Whether a place of the picture, across and down in pixels, is thought to show the object.
+pub type Guess<'a> = &'a dyn Fn([f64; 2]) -> bool;
+
+/// Room around the box from which the surroundings are learnt, as a share of its longer side.
+const SURROUNDINGS: f64 = 0.3;
+/// How far the object may reach out of the box, likewise; and where it is guessed.
+const SLACK: f64 = 0.02;
+const SLACK_OF_GUESS: f64 = 0.15;
+/// The longer side of what is looked at has at most this many cells.
+const FINEST: f64 = 256.0;
+/// Fewer cells of either side say nothing about its colours, and more than so many say nothing new.
+const FEWEST: usize = 16;
+const MOST: usize = 4096;
+/// Turns of colours and outline.
+const ROUNDS: usize = 6;
+/// What a cell's colour counts, beside a cell's length of outline.
+const COLOUR: f32 = 0.01;
+/// One cell's logarithm of odds is at most this.
+const SUREST: f64 = 20.0;
+/// Logarithm of the odds far within, or outside of, what is guessed; and how wide the doubt about its edge is, as a share of the box's longer side.
+const TRUST: f64 = 6.0;
+const DOUBT: f64 = 0.08;
+
+/// What is known of the object in a box.
+#[derive(Clone, Copy, Default)]
+pub struct Known<'a> {
+    /// Colours that it has, in [-1, 1], as many of each as there is of it.
+    pub colours: &'a [[f32; 3]],
+    /// Where it is thought to be, as by a pose; what colours say of its edge goes before.
+    pub place: Option<Guess<'a>>,
+}
+
+/// How much of each pixel is the object, 0 to 1, `[height · width]`. `None` where nothing of the box differs from what is around it, or nothing is around it.
+pub(crate) fn object_in(picture: &Pixels, bounds: BoundingBox, known: Known) -> Option<Vec<f32>> {
+    let grid = Grid::around(picture, bounds)?;
+    let longer = bounds.size[0].max(bounds.size[1]);
+    let slack = longer * if known.place.is_some() { SLACK_OF_GUESS } else { SLACK };
+    let may_be = grid.each(|at| bounds.is_within(at, slack));
+    let prior = known.place.map_or(vec![0.0; may_be.len()], |place| grid.prior(&grid.each(place), DOUBT * longer));
+    let mut object = match known.place {
+        Some(place) => grid.each(|at| place(at) && bounds.is_within(at, slack)),
+        None => grid.each(|at| bounds.is_within(at, 0.0)),
+    };
+    let palette: Vec<DVec3> = known.colours.iter().map(|colour| DVec3::from(colour.map(f64::from))).collect();
+    let edges = grid.edges();
+    for round in 0..ROUNDS {
+        let side = |of: bool| grid.colours.iter().zip(&object).filter(move |(_, is_in)| **is_in == of).map(|(colour, _)| *colour);
+        let mut own = side(true).collect::<Vec<_>>();
+        // At first the box has other things in it, too.
+        let is_first = round == 0 && known.place.is_none() && !palette.is_empty();
+        if is_first {
+            own.clone_from(&palette);
+        }
+        let (own, other) = (Mixture::of(&own)?, Mixture::of(&side(false).collect::<Vec<_>>())?);
+        let cost = |((&colour, &may_be), prior): ((&DVec3, &bool), &f64)| {
+            let odds = other.log_density(colour) - own.log_density(colour);
+            let odds = odds.clamp(-SUREST, SUREST) - prior;
+            if may_be { COLOUR * odds as f32 } else { f32::MAX.sqrt() }
+        };
+        let costs: Vec<f32> = grid.colours.iter().zip(&may_be).zip(&prior).map(cost).collect();
+        let cut = cut(&costs, &edges, grid.size[0], &object);
+        if std::mem::replace(&mut object, cut) == object {
+            break;
+        }
+    }
+    object.contains(&true).then(|| grid.on(picture, &object))
+}
+
+impl BoundingBox {
+    /// Whether a place is in it, or so near.
+    fn is_within(&self, at: [f64; 2], slack: f64) -> bool {
+        (0..2).all(|k| (self.corner[k] - slack..=self.corner[k] + self.size[k] + slack).contains(&at[k]))
+    }
+}
+
+/// A part of a picture in cells of equal size.
+struct Grid {
+    /// Columns and rows.
+    size: [usize; 2],
+    /// Edge of the first cell in the picture, and the pixels of one across and down.
+    corner: [f64; 2],
+    pitch: [f64; 2],
+    /// Means in [-1, 1], row-major.
+    colours: Vec<DVec3>,
+}
+
+impl Grid {
+    /// The box and its surroundings, as far as the picture goes; `None` where the box lies outside of it.
+    fn around(picture: &Pixels, bounds: BoundingBox) -> Option<Self> {
+        let room = SURROUNDINGS * bounds.size[0].max(bounds.size[1]);
+        let ends = [0, 1].map(|k| {
+            let whole = [picture.width, picture.height][k] as f64;
+            let (first, end) = (bounds.corner[k] - room, bounds.corner[k] + bounds.size[k] + room);
+            [first.floor().clamp(0.0, whole), end.ceil().clamp(0.0, whole)]
+        });
+        let [across, down] = ends.map(|[first, end]| (end - first) as usize);
+        let finer = (FINEST / across.max(down) as f64).min(1.0);
+        let size = [across, down].map(|pixels| (pixels as f64 * finer).round() as usize);
+        if size.contains(&0) {
+            return None;
+        }
+        let rows = picture.data.chunks_exact(3 * picture.width).skip(ends[1][0] as usize).take(down);
+        let data = rows.flat_map(|row| &row[3 * ends[0][0] as usize..][..3 * across]).copied().collect();
+        let cells = Pixels { width: across, height: down, data }.area_resample(size[0], size[1]);
+        Some(Grid {
+            size,
+            corner: ends.map(|[first, _]| first),
+            pitch: [across as f64 / size[0] as f64, down as f64 / size[1] as f64],
+            colours: cells.data.chunks_exact(3).map(|c| DVec3::new(c[0].into(), c[1].into(), c[2].into())).collect(),
+        })
+    }
+
+    /// Something of the middle of each cell, in pixels of the picture.
+    fn each(&self, of: impl Fn([f64; 2]) -> bool) -> Vec<bool> {
+        let place = |i: usize| {
+            let cell = [i % self.size[0], i / self.size[0]];
+            [0, 1].map(|k| self.corner[k] + (cell[k] as f64 + 0.5) * self.pitch[k])
+        };
+        (0..self.colours.len()).map(|i| of(place(i))).collect()
+    }
+
+    /// Logarithm of the odds that a cell is the object, by a guess whose edge is off by some `pixels`.
+    fn prior(&self, guess: &[bool], pixels: f64) -> Vec<f64> {
+        let [width, height] = self.size.map(|cells| cells as u32);
+        let guess = guess.iter().map(|&is_object| f32::from(u8::from(is_object))).collect();
+        let guess: ImageBuffer<Luma<f32>, Vec<f32>> = ImageBuffer::from_vec(width, height, guess).unwrap_or_default();
+        let smooth = imageops::blur(&guess, (pixels / self.pitch[0]) as f32);
+        smooth.into_iter().map(|share| TRUST * (2.0 * f64::from(*share) - 1.0)).collect()
+    }
+
+    /// What a length of outline costs in each cell: little where the picture has an edge.
+    fn edges(&self) -> Vec<f32> {
+        let width = self.size[0];
+        let step = |i: usize, on: usize| self.colours.get(on).map_or(0.0, |next| next.distance_squared(self.colours[i]));
+        let steps = |i: usize| if (i + 1) % width == 0 { 0.0 } else { step(i, i + 1) } + step(i, i + width);
+        let steps: Vec<f64> = (0..self.colours.len()).map(steps).collect();
+        let mean = 0.5 * steps.iter().sum::<f64>() / steps.len() as f64;
+        steps.into_iter().map(|step| (0.02 + (-step / (2.0 * mean + 1e-12)).exp()) as f32).collect()
+    }
+
+    /// What cells say of the pixels of the picture; smooth between cells.
+    fn on(&self, picture: &Pixels, object: &[bool]) -> Vec<f32> {
+        let share = |pixel: usize| {
+            let at = [pixel % picture.width, pixel / picture.width];
+            let [x, y] = [0, 1].map(|k| (at[k] as f64 + 0.5 - self.corner[k]) / self.pitch[k] - 0.5);
+            let is_out = |at: f64, cells: usize| at <= -1.0 || at >= cells as f64;
+            if is_out(x, self.size[0]) || is_out(y, self.size[1]) {
+                return 0.0;
+            }
+            let near = |at: f64, cells: usize| {
+                let (first, second) = (at.max(0.0) as usize, (at + 1.0) as usize);
+                [(first.min(cells - 1), 1.0 - at.max(0.0).fract()), (second.min(cells - 1), at.max(0.0).fract())]
+            };
+            let row = |y: usize| {
+                let in_row = near(x, self.size[0]).map(|(x, part)| if object[y * self.size[0] + x] { part } else { 0.0 });
+                in_row[0] + in_row[1]
+            };
+            near(y, self.size[1]).map(|(y, part)| part * row(y)).iter().sum::<f64>() as f32
+        };
+        (0..picture.width * picture.height).map(share).collect()
+    }
+}
+
+/// The region with the least sum of its costs and the lengths of its outline, near `start`: a program that is convex where cells may belong to it by
+/// shares, by the steps of Chambolle and Pock (2011).
+fn cut(costs: &[f32], edges: &[f32], width: usize, start: &[bool]) -> Vec<bool> {
+    const STEPS: usize = 150;
+    // Both steps, for differences whose norm is at most the root of eight.
+    const STEP: f32 = 0.353;
+    let mut share: Vec<f32> = start.iter().map(|&is_in| f32::from(u8::from(is_in))).collect();
+    let mut ahead = share.clone();
+    let (mut across, mut down) = (vec![0.0f32; share.len()], vec![0.0f32; share.len()]);
+    for _ in 0..STEPS {
+        for row in 0..share.len() / width {
+            let (own, next) = ahead[row * width..].split_at(width);
+            let (across, down) = (&mut across[row * width..][..width], &mut down[row * width..][..width]);
+            for x in 0..width - 1 {
+                across[x] += STEP * (own[x + 1] - own[x]);
+            }
+            // Nothing lies below the last row.
+            for ((down, next), own) in down.iter_mut().zip(next).zip(own) {
+                *down += STEP * (next - own);
+            }
+            for ((across, down), edge) in across.iter_mut().zip(down).zip(&edges[row * width..]) {
+                let longer = ((*across * *across + *down * *down).sqrt() / edge).max(1.0);
+                (*across, *down) = (*across / longer, *down / longer);
+            }
+        }
+        for i in 0..share.len() {
+            // The last of a row has no flow to the next one's first.
+            let before = if i == 0 { 0.0 } else { across[i - 1] };
+            let above = if i < width { 0.0 } else { down[i - width] };
+            let flow = across[i] - before + down[i] - above;
+            let next = (share[i] + STEP * (flow - costs[i])).clamp(0.0, 1.0);
+            ahead[i] = 2.0 * next - share[i];
+            share[i] = next;
+        }
+    }
+    share.into_iter().map(|share| share > 0.5).collect()
+}
+
+/// Colours as a sum of Gaussians.
+struct Mixture(Vec<Gaussian>);
+
+struct Gaussian {
+    /// Logarithm of what it has of all, over its width.
+    height: f64,
+    mean: DVec3,
+    precision: DMat3,
+}
+
+/// Gaussians of each side.
+const PARTS: usize = 5;
+/// Variance that every colour has, of [-1, 1]: four or five steps of 255.
+const NOISE: f64 = 1.2e-3;
+
+impl Mixture {
+    /// Of the colours of a side; `None` of too few.
+    fn of(colours: &[DVec3]) -> Option<Self> {
+        const TURNS: usize = 8;
+        if colours.len() < FEWEST {
+            return None;
+        }
+        let own: Vec<DVec3> = colours.iter().copied().step_by(colours.len().div_ceil(MOST)).collect();
+        let first = split(&own);
+        let mut mixture = Mixture::with(&own, |i, part| f64::from(u8::from(first[i] == part)));
+        for _ in 0..TURNS {
+            let parts: Vec<[f64; PARTS]> = own.iter().map(|&colour| mixture.parts(colour)).collect();
+            mixture = Mixture::with(&own, |i, part| parts[i][part]);
+        }
+        Some(mixture)
+    }
+
+    /// Of colours that belong to each part as far as it says.
+    fn with(own: &[DVec3], belongs: impl Fn(usize, usize) -> f64) -> Self {
+        let gaussian = |part: usize| {
+            let weighted = || own.iter().enumerate().map(|(i, &colour)| (colour, belongs(i, part)));
+            let weight = weighted().map(|(_, weight)| weight).sum::<f64>().max(1e-9);
+            let mean = weighted().map(|(colour, weight)| weight * colour).sum::<DVec3>() / weight;
+            let outer = |(colour, weight): (DVec3, f64)| {
+                let off = colour - mean;
+                DMat3::from_cols(off.x * off, off.y * off, off.z * off) * weight
+            };
+            let spread = weighted().map(outer).fold(DMat3::ZERO, |sum, next| sum + next);
+            let covariance = spread * weight.recip() + DMat3::from_diagonal(DVec3::splat(NOISE));
+            let height = (weight / own.len() as f64).ln() - 0.5 * covariance.determinant().ln();
+            Gaussian { height, mean, precision: covariance.inverse() }
+        };
+        Mixture((0..PARTS).map(gaussian).collect())
+    }
+
+    fn exponents(&self, colour: DVec3) -> impl Iterator<Item = f64> {
+        self.0.iter().map(move |Gaussian { height, mean, precision }| {
+            let off = colour - *mean;
+            height - 0.5 * off.dot(*precision * off)
+        })
+    }
+
+    /// How far a colour belongs to each part.
+    fn parts(&self, colour: DVec3) -> [f64; PARTS] {
+        let density = self.log_density(colour);
+        let mut parts = [0.0; PARTS];
+        parts.iter_mut().zip(self.exponents(colour)).for_each(|(part, exponent)| *part = (exponent - density).exp());
+        parts
+    }
+
+    /// But for a constant.
+    fn log_density(&self, colour: DVec3) -> f64 {
+        let most = self.exponents(colour).fold(f64::NEG_INFINITY, f64::max);
+        most + self.exponents(colour).map(|exponent| (exponent - most).exp()).sum::<f64>().ln()
+    }
+}
+
+/// To which of the [`PARTS`] each colour belongs at first: again and again the one that is most spread is cut through its mean.
+fn split(own: &[DVec3]) -> Vec<usize> {
+    let mut parts = vec![0; own.len()];
+    for new in 1..PARTS {
+        let spread = |part: usize| {
+            let in_part = || own.iter().zip(&parts).filter(move |(_, of)| **of == part).map(|(colour, _)| *colour);
+            let mean = in_part().sum::<DVec3>() / in_part().count().max(1) as f64;
+            (in_part().map(|colour| (colour - mean) * (colour - mean)).sum::<DVec3>(), mean, part)
+        };
+        let most = (0..new).map(spread).max_by(|a, b| a.0.max_element().total_cmp(&b.0.max_element()));
+        let Some((spread, mean, part)) = most else { break };
+        let channel = (0..3).max_by(|&a, &b| spread[a].total_cmp(&spread[b])).unwrap_or(0);
+        for (colour, of) in own.iter().zip(&mut parts) {
+            if *of == part && colour[channel] > mean[channel] {
+                *of = new;
+            }
+        }
+    }
+    parts
+}
