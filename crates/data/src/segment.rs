@@ -35,6 +35,8 @@ const ROUNDS: usize = 6;
 const COLOUR: f32 = 0.01;
 /// One cell's logarithm of odds is at most this.
 const SUREST: f64 = 20.0;
+/// Logarithm of the density of any colour at all.
+const ANYTHING: f64 = -5.0;
 /// Logarithm of the odds far within, or outside of, what is guessed; and how wide the doubt about its edge is, as a share of the box's longer side.
 const TRUST: f64 = 6.0;
 const DOUBT: f64 = 0.08;
@@ -71,8 +73,9 @@ pub(crate) fn object_in(picture: &Pixels, bounds: BoundingBox, known: Known) -> 
         }
         let (own, other) = (Mixture::of(&own)?, Mixture::of(&side(false).collect::<Vec<_>>())?);
         let cost = |((&colour, &may_be), prior): ((&DVec3, &bool), &f64)| {
-            let odds = other.log_density(colour) - own.log_density(colour);
-            let odds = odds.clamp(-SUREST, SUREST) - prior;
+            // Nor is it what neither has, as long as that is all there is to go by.
+            let other = other.log_density(colour).max(if is_first { ANYTHING } else { f64::NEG_INFINITY });
+            let odds = (other - own.log_density(colour)).clamp(-SUREST, SUREST) - prior;
             if may_be { COLOUR * odds as f32 } else { f32::MAX.sqrt() }
         };
         let costs: Vec<f32> = grid.colours.iter().zip(&may_be).zip(&prior).map(cost).collect();
@@ -308,4 +311,80 @@ fn split(own: &[DVec3]) -> Vec<usize> {
         }
     }
     parts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WIDTH: usize = 120;
+    const BOX: BoundingBox = BoundingBox { corner: [40.0, 25.0], size: [40.0, 30.0] };
+
+    /// A red disc with a blue middle on green squares; what differs from pixel to pixel is no edge.
+    fn picture() -> Pixels {
+        let colour = |i: usize| {
+            let (x, y) = (i % WIDTH, i / WIDTH);
+            let noise = [0.05, -0.03, 0.08, 0.0, -0.06][(7 * x + 3 * y) % 5];
+            let [r, g, b] = match from_middle(i) {
+                off if off < 0.4 => [-0.8, -0.6, 0.7],
+                off if off < 1.0 => [0.6, -0.6, -0.5],
+                _ if (x / 15 + y / 15).is_multiple_of(2) => [-0.4, 0.5, -0.3],
+                _ => [-0.6, 0.2, -0.4],
+            };
+            [r + noise, g + noise, b - noise]
+        };
+        Pixels { width: WIDTH, height: 80, data: (0..80 * WIDTH).flat_map(colour).collect() }
+    }
+
+    /// How far a pixel is from the middle of the box, of the ellipse in it.
+    fn from_middle(i: usize) -> f64 {
+        let place = [(i % WIDTH) as f64 + 0.5, (i / WIDTH) as f64 + 0.5];
+        let off = [0, 1].map(|k| (place[k] - BOX.corner[k]) / BOX.size[k] * 2.0 - 1.0);
+        off[0].hypot(off[1])
+    }
+
+    /// How many pixels are taken for what they are not.
+    fn wrong(object: &[f32], is_object: impl Fn(usize) -> bool) -> usize {
+        object.iter().enumerate().filter(|(i, share)| (**share > 0.5) != is_object(*i)).count()
+    }
+
+    #[test]
+    fn what_is_in_a_box_is_found_by_its_colours() {
+        let picture = picture();
+        let found = |bounds| object_in(&picture, bounds, Known::default()).unwrap();
+        let is_object = |i| from_middle(i) < 1.0;
+        let area = (0..picture.width * picture.height).filter(|&i| is_object(i)).count();
+        assert!(wrong(&found(BOX), is_object) < area / 50, "{} of {area}", wrong(&found(BOX), is_object));
+        // Boxes of detectors are not tight.
+        let loose = BoundingBox { corner: [34.0, 22.0], size: [50.0, 38.0] };
+        assert!(wrong(&found(loose), is_object) < area / 50);
+        let tight = BoundingBox { corner: [40.4, 25.3], size: [39.2, 29.4] };
+        assert!(wrong(&found(tight), is_object) < area / 50);
+    }
+
+    #[test]
+    fn what_is_known_of_the_object_takes_the_rest_out_of_the_box() {
+        let picture = picture();
+        let is_middle = |i| from_middle(i) < 0.4;
+        let area = (0..picture.width * picture.height).filter(|&i| is_middle(i)).count();
+        // The ring goes around the middle as the middle's own surroundings do not: by colours alone both are the object.
+        let found = |known| object_in(&picture, BOX, known).unwrap();
+        assert!(wrong(&found(Known::default()), is_middle) > area);
+        let place = |[x, y]: [f64; 2]| from_middle(y as usize * WIDTH + x as usize) < 0.45;
+        let by_place = found(Known { place: Some(&place), ..Known::default() });
+        assert!(wrong(&by_place, is_middle) < area / 10, "{} of {area}", wrong(&by_place, is_middle));
+        let blue = [[-0.8, -0.6, 0.7], [-0.75, -0.55, 0.65], [-0.85, -0.65, 0.75]].repeat(20);
+        let by_colours = found(Known { colours: &blue, place: None });
+        assert!(wrong(&by_colours, is_middle) < area / 10, "{} of {area}", wrong(&by_colours, is_middle));
+    }
+
+    #[test]
+    fn an_object_that_fills_the_picture_or_lies_outside_is_none() {
+        let picture = picture();
+        for (corner, size) in [([0.0; 2], [120.0, 80.0]), ([200.0, 10.0], [30.0; 2]), ([-90.0, 10.0], [30.0; 2])] {
+            assert_eq!(object_in(&picture, BoundingBox { corner, size }, Known::default()), None, "{corner:?}");
+        }
+        let grey = Pixels { data: vec![0.0; picture.data.len()], ..picture };
+        assert_eq!(object_in(&grey, BOX, Known::default()), None);
+    }
 }

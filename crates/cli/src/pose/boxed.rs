@@ -43,14 +43,17 @@ impl Boxed<'_> {
     /// trusted it begins once more with the colours of the model's object; what leaves less unexplained counts.
     pub fn search(&self, numbers: &[usize], pictures: Vec<Picture>, pass: Pass) -> Result<Vec<Outcome>> {
         let mut outcomes = self.in_turns(numbers, pictures, pass)?;
-        let lost: Vec<usize> = (0..numbers.len()).filter(|&i| !outcomes[i].found.is_trusted()).collect();
+        let (mut lost, mut anew) = (Vec::new(), Vec::new());
+        for (i, Outcome { picture, .. }) in outcomes.iter().enumerate().filter(|(_, outcome)| !outcome.found.is_trusted()) {
+            let colours = self.colours(picture.instance)?;
+            // Nothing in the box may have those colours.
+            if let Ok(picture) = (self.open)(numbers[i], Known { colours: &colours, place: None }) {
+                lost.push(i);
+                anew.push(picture);
+            }
+        }
         if lost.is_empty() {
             return Ok(outcomes);
-        }
-        let mut anew = Vec::new();
-        for &i in &lost {
-            let colours = self.colours(outcomes[i].picture.instance)?;
-            anew.push((self.open)(numbers[i], Known { colours: &colours, place: None })?);
         }
         let again = self.in_turns(&lost.iter().map(|&i| numbers[i]).collect::<Vec<_>>(), anew, pass)?;
         for (i, mut other) in lost.into_iter().zip(again) {
@@ -70,7 +73,9 @@ impl Boxed<'_> {
         let mut anew = Vec::new();
         for (&number, Outcome { picture, found, .. }) in numbers.iter().zip(&first) {
             let object = FoundObject::of(picture, found, self.on, 1)?;
-            anew.push((self.open)(number, Known { colours: &[], place: Some(&|at| object.covers(at)) })?);
+            let cut = (self.open)(number, Known { colours: &[], place: Some(&|at| object.covers(at)) });
+            // Or nothing, where the pose is far off.
+            anew.push(cut.unwrap_or_else(|_| picture.clone()));
         }
         let near: Vec<_> = first.iter().map(|outcome| neighbor4(&outcome.found.world_from_camera)).collect();
         let mut second = pass(anew, &near)?;
