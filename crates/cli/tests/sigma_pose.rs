@@ -539,6 +539,11 @@ fn bad_calls_end_with_2_and_one_line() {
         (format!("{image} {model} --mask a.png --mask b.png"), &["--mask", "2 masks for 1"]),
         (format!("{image} {model} --cutout nowhere.png"), &["nowhere.png"]),
         (format!("{image} {model} --cutout a.png --cutout b.png"), &["--cutout", "2 masks for 1"]),
+        (format!("{image} {model} --box 1,2,3"), &["--box", "left edge"]),
+        (format!("{image} {model} --box 1,2,3,-4"), &["--box", "left edge"]),
+        (format!("{image} {model} --box 1,2,9,9 --box 1,2,9,9"), &["--box", "2 boxes for 1"]),
+        (format!("{image} {model} --box 1,2,9,9 --cutout a.png"), &["--box", "--cutout"]),
+        (format!("{image} {model} --box 90,90,9,9"), &["000003.png", "box 90,90,9,9", "64×64"]),
         (format!("{image} {model} --truth nan.txt --truth nan.txt"), &["--truth", "2 poses for 1"]),
         (format!("{image} {model} --loss l3"), &["l3", "gmsd"]),
         (format!("{image} {model} --loss mse"), &["--loss", "--preset paper"]),
@@ -843,6 +848,35 @@ fn a_camera_may_be_rolled() {
         let off = report["images"][0]["error"]["rotation_deg"].as_f64().unwrap();
         assert!(off < 1.0, "{name}: {off}°");
     }
+}
+
+/// Not cut out: an object before another one on a chequered table, a box around it.
+#[test]
+fn a_box_around_the_object_is_enough() {
+    let home = TempDir::new().unwrap();
+    let dir = home.path();
+    let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/models/compact.safetensors");
+    let view = |object: &str| image::open(format!("{TEST}/{object}/rgb/000006.png")).unwrap().into_rgb8();
+    let (seat, forklift) = (view("seat"), view("forklift"));
+    // Where the pictures lie in the photograph.
+    let (front, behind) = ([50, 30], [80, 45]);
+    let of = |picture: &image::RgbImage, [dx, dy]: [u32; 2], x: u32, y: u32| {
+        let pixel = picture.get_pixel_checked(x.checked_sub(dx)?, y.checked_sub(dy)?)?;
+        (pixel.0 != [255; 3]).then_some(*pixel)
+    };
+    let table = |x: u32, y: u32| image::Rgb(if (x / 9 + y / 9).is_multiple_of(2) { [120, 92, 70] } else { [150, 120, 96] });
+    let pixel = |x, y| of(&seat, front, x, y).or_else(|| of(&forklift, behind, x, y)).unwrap_or_else(|| table(x, y));
+    image::RgbImage::from_fn(160, 128, pixel).save(dir.join("photo.png")).unwrap();
+    fs::write(dir.join("camera.txt"), "74.4 82 62 0.\n0. 0. 0.\n1.\n128 160\n").unwrap();
+    let places = || (0..128).flat_map(|y| (0..160).map(move |x| (x, y))).filter(|&(x, y)| of(&seat, front, x, y).is_some());
+    let [columns, rows]: [Vec<u32>; 2] = [places().map(|(x, _)| x).collect(), places().map(|(_, y)| y).collect()];
+    let [(left, right), (top, bottom)] = [columns, rows].map(|at| (*at.iter().min().unwrap(), at.iter().max().unwrap() + 1));
+    let given = format!("--box {left},{top},{},{} --intrinsics camera.txt", right - left, bottom - top);
+    let args = format!("--model {model} --instance seat --truth DATA/seat/pose/000006.txt --executor cpu --effort fast --json");
+    let found = json(&run(dir, &format!("estimate photo.png {given} {args} --record out"), 0))["images"][0].take();
+    let off = found["error"]["rotation_deg"].as_f64().unwrap();
+    assert!(off < 1.5 && found["trusted"] == true && found["within_95"] == true, "{found}");
+    assert_eq!(files(&dir.join("out")), ["seat-photo-outline.png", "seat-photo.gif", "seat-photo.png"]);
 }
 
 /// Pictures cut out with a rim of the table around the object, or with too little of it.

@@ -71,7 +71,9 @@ impl Target {
         let object = match cutout {
             None => None,
             Some(Cutout::Mask(mask)) => Some(counts(mask, size)?),
-            Some(Cutout::Box(bounds, known)) => Some(object_in(&picture, bounds, known).ok_or_else(|| nothing_in(path, bounds, size))?),
+            Some(Cutout::Box(bounds, known)) => {
+                Some(object_in(&picture, bounds, known).ok_or_else(|| nothing_in(path, bounds, size))?)
+            }
         };
         if let Some(object) = object {
             for ((colours, opacity), object) in picture.data.chunks_exact_mut(3).zip(&mut opacity).zip(object) {
@@ -126,7 +128,11 @@ impl Target {
 }
 
 /// Of a box in which no object is seen.
-fn nothing_in(path: &Path, BoundingBox { corner: [x, y], size: [width, height] }: BoundingBox, [across, down]: [usize; 2]) -> Error {
+fn nothing_in(
+    path: &Path,
+    BoundingBox { corner: [x, y], size: [width, height] }: BoundingBox,
+    [across, down]: [usize; 2],
+) -> Error {
     Error::field(
         path,
         format!("box {x},{y},{width},{height}"),

@@ -10,7 +10,7 @@ use std::process::{Command, ExitCode, Output};
 
 use image::imageops::{self, FilterType};
 use image::{Rgb, RgbImage, Rgba};
-use rand::SeedableRng;
+use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde_json::Value;
 use srn_data::sheet;
@@ -20,7 +20,7 @@ use crate::photo::{Lit, OUTSIDE, Photo, SIDE, Spoil, Spoiled, exposed};
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
 const USAGE: &str =
-    "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [others] [--seed N] [--starts STARTS]";
+    "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [others] [--seed N] [--starts STARTS]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -88,7 +88,7 @@ struct Table {
     rows: &'static [Row],
 }
 
-const TABLES: [Table; 8] = [
+const TABLES: [Table; 9] = [
     Table {
         name: "distance",
         searches: &[AROUND_FAST],
@@ -153,6 +153,15 @@ const TABLES: [Table; 8] = [
         name: "hidden",
         searches: &[AROUND, AROUND_FAST],
         rows: &[row("3/10 hidden", Spoil::Bar(0.3)), row("half hidden", Spoil::Bar(0.5)), row("3/10 cut off", Spoil::Edge(0.3))],
+    },
+    Table {
+        name: "boxes",
+        searches: &[AROUND, AROUND_FAST],
+        rows: &[
+            row("on a table", Spoil::Among(0, 0)),
+            row("seven others behind it", Spoil::Among(7, 0)),
+            row("the next object", Spoil::Among(7, 1)),
+        ],
     },
     Table {
         name: "others",
@@ -228,6 +237,7 @@ fn run() -> Result<()> {
 struct Picture {
     picture: PathBuf,
     mask: Option<PathBuf>,
+    bounds: Option<[u32; 4]>,
     intrinsics: PathBuf,
     truth: PathBuf,
 }
@@ -295,7 +305,7 @@ impl Programs {
 
     /// What the search finds of an object's pictures.
     fn estimated(&self, row: &Row, how: How, object: usize, pictures: &[Picture]) -> Result<Vec<Found>> {
-        let claimed = if let Spoil::Another(further) = row.spoil { object + further } else { object };
+        let claimed = if let Spoil::Another(further) | Spoil::Among(_, further) = row.spoil { object + further } else { object };
         let mut found = Vec::new();
         for picture in pictures {
             let mut estimate = self.command("sigma-pose");
@@ -308,6 +318,9 @@ impl Programs {
             };
             if let Some(mask) = &picture.mask {
                 estimate.arg("--mask").arg(mask);
+            }
+            if let Some([x, y, width, height]) = picture.bounds {
+                estimate.arg(format!("--box={x},{y},{width},{height}"));
             }
             let output = estimate.output()?;
             let report: Value = serde_json::from_slice(&output.stdout).map_err(|_| said(&output))?;
@@ -362,11 +375,19 @@ fn spoiled(row: &Row, views: &Path, folder: &Path, seed: u64) -> Result<Vec<Pict
     std::fs::create_dir_all(folder)?;
     let mut random = Pcg64Mcg::seed_from_u64(seed);
     let mut pictures = Vec::new();
-    for (name, _) in OBJECTS {
+    let of = |name: &str, view: usize, kind: &str| views.join(name).join(kind).join(format!("{view:06}"));
+    let rendered = |name: &str, view: usize| image::open(of(name, view, "rgb").with_extension("png")).map(|view| view.to_rgb8());
+    for (object, (name, _)) in OBJECTS.into_iter().enumerate() {
         for view in 0..VIEWS {
-            let file = |kind: &str| views.join(name).join(kind).join(format!("{view:06}"));
-            let rendered = image::open(file("rgb").with_extension("png"))?.to_rgb8();
-            let Spoiled { picture, mask, corner } = Photo::new(&rendered, &mut random).spoiled(row.spoil, view, &mut random);
+            let photo = Photo::new(&rendered(name, view)?, &mut random);
+            let others = if let Spoil::Among(count, _) = row.spoil { count } else { 0 };
+            let mut behind = Vec::new();
+            for _ in 0..others {
+                let (other, _) = OBJECTS[(object + random.random_range(1..OBJECTS.len())) % OBJECTS.len()];
+                behind.push(rendered(other, random.random_range(0..VIEWS))?);
+            }
+            let Spoiled { picture, mask, bounds, corner } =
+                photo.among(&behind, &mut random).spoiled(row.spoil, view, &mut random);
             let path = |end: &str| folder.join(format!("{name}-{view}{end}"));
             picture.save(path(".png"))?;
             let mask = mask.map(|mask| mask.save(path("-mask.png")).map(|()| path("-mask.png"))).transpose()?;
@@ -376,8 +397,9 @@ fn spoiled(row: &Row, views: &Path, folder: &Path, seed: u64) -> Result<Vec<Pict
             pictures.push(Picture {
                 picture: path(".png"),
                 mask,
+                bounds,
                 intrinsics: path(".txt"),
-                truth: file("pose").with_extension("txt"),
+                truth: of(name, view, "pose").with_extension("txt"),
             });
         }
     }

@@ -44,6 +44,8 @@ pub enum Spoil {
     Edge(f64),
     /// Given as another of the objects, so many further on.
     Another(usize),
+    /// Not cut out: on the table, so many others behind it, and a box around it; then given as another, so many further on.
+    Among(usize, usize),
 }
 
 /// A picture of an object on a table.
@@ -58,6 +60,8 @@ pub struct Spoiled {
     pub picture: RgbaImage,
     /// What counts, if not all.
     pub mask: Option<GrayImage>,
+    /// Left edge, top edge, width and height of a box around the object.
+    pub bounds: Option<[u32; 4]>,
     /// Where in the whole picture its first pixel was.
     pub corner: [u32; 2],
 }
@@ -77,10 +81,26 @@ impl Photo {
         Photo { picture: RgbImage::from_fn(SIDE, SIDE, colour), object: GrayImage::from_fn(SIDE, SIDE, object) }
     }
 
+    /// With other rendered objects behind it, anywhere.
+    pub fn among(mut self, others: &[RgbImage], random: &mut Pcg64Mcg) -> Self {
+        for other in others {
+            let [dx, dy] = [(); 2].map(|()| random.random_range(-110..=110));
+            for (x, y, pixel) in self.picture.enumerate_pixels_mut() {
+                let at = |at: u32, by: i64| u32::try_from(i64::from(at) - by).unwrap_or(SIDE);
+                let behind = other.get_pixel_checked(at(x, dx), at(y, dy)).filter(|colour| colour.0 != [255; 3]);
+                if let (OUTSIDE, Some(colour)) = (*self.object.get_pixel(x, y), behind) {
+                    *pixel = *colour;
+                }
+            }
+        }
+        self
+    }
+
     /// With something wrong; bars, edges and what is lacking come from another side in each `view`.
     pub fn spoiled(&mut self, spoil: Spoil, view: usize, random: &mut Pcg64Mcg) -> Spoiled {
-        let [[_, right], [top, bottom]] = self.extent();
+        let [[left, right], [top, bottom]] = self.extent();
         let (mut seen, mut mask, mut frame) = (self.object.clone(), None, [[0, SIDE]; 2]);
+        let mut bounds = None;
         match spoil {
             Spoil::Nothing | Spoil::Another(_) => {}
             Spoil::Light(lit) => self.lit_by(lit),
@@ -113,6 +133,10 @@ impl Photo {
                 let side = self.side(part, view);
                 fill(&mut seen, |x, y| [x, y].iter().zip(side).all(|(at, [first, end])| (first..end).contains(at)), OUTSIDE);
             }
+            Spoil::Among(..) => {
+                bounds = Some([left, top, right + 1 - left, bottom + 1 - top]);
+                seen = GrayImage::from_pixel(SIDE, SIDE, INSIDE);
+            }
             Spoil::Alone(lit) => {
                 self.lit_by(lit);
                 mask = Some(std::mem::replace(&mut seen, GrayImage::from_pixel(SIDE, SIDE, INSIDE)));
@@ -140,7 +164,7 @@ impl Photo {
             let (Rgb([r, g, b]), Luma([a])) = (self.picture.get_pixel(left + x, top + y), seen.get_pixel(left + x, top + y));
             Rgba([*r, *g, *b, *a])
         };
-        Spoiled { picture: RgbaImage::from_fn(end - left, below - top, pixel), mask, corner: [left, top] }
+        Spoiled { picture: RgbaImage::from_fn(end - left, below - top, pixel), mask, bounds, corner: [left, top] }
     }
 
     /// The object's first and last column, and row.
