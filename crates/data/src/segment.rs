@@ -146,14 +146,14 @@ impl Grid {
         let guess = guess.iter().map(|&is_object| f32::from(u8::from(is_object))).collect();
         let guess: ImageBuffer<Luma<f32>, Vec<f32>> = ImageBuffer::from_vec(width, height, guess).unwrap_or_default();
         let smooth = imageops::blur(&guess, (pixels / self.pitch[0]) as f32);
-        smooth.into_iter().map(|share| TRUST * (2.0 * f64::from(*share) - 1.0)).collect()
+        smooth.iter().map(|share| TRUST * (2.0 * f64::from(*share) - 1.0)).collect()
     }
 
     /// What a length of outline costs in each cell: little where the picture has an edge.
     fn edges(&self) -> Vec<f32> {
         let width = self.size[0];
         let step = |i: usize, on: usize| self.colours.get(on).map_or(0.0, |next| next.distance_squared(self.colours[i]));
-        let steps = |i: usize| if (i + 1) % width == 0 { 0.0 } else { step(i, i + 1) } + step(i, i + width);
+        let steps = |i: usize| if (i + 1).is_multiple_of(width) { 0.0 } else { step(i, i + 1) } + step(i, i + width);
         let steps: Vec<f64> = (0..self.colours.len()).map(steps).collect();
         let mean = 0.5 * steps.iter().sum::<f64>() / steps.len() as f64;
         steps.into_iter().map(|step| (0.02 + (-step / (2.0 * mean + 1e-12)).exp()) as f32).collect()
