@@ -254,8 +254,8 @@ fn searched(
             pass(pictures, &starts)?
         };
         for Outcome { picture, found, .. } in &outcomes {
-            saved.iter_mut().try_for_each(|saved| saved.add(picture, found, on.side))?;
             output.add(picture, on.model.instance_name(picture.instance), found, found.estimate.ranking.len(), &bar)?;
+            saved.iter_mut().try_for_each(|saved| saved.add(picture, found, on.side))?;
         }
         if let Some(dir) = &args.record {
             for (number, Outcome { picture, found, log: (log, i) }) in numbers.into_iter().zip(&outcomes) {

@@ -34,7 +34,7 @@ pub struct SearchArgs {
     #[arg(long, value_enum, default_value_t = Preset::Default)]
     preset: Preset,
     /// How hard the default preset tries: for poses that are roughly known, in general, for what that has lost. `normal` is followed by
-    /// `exhaustive` for a picture whose pose is not to be trusted, but not in `track`.
+    /// `exhaustive` for a picture whose pose is not to be trusted, but not in `track`, nor with `--box`.
     #[arg(long, value_enum, default_value_t = HowHard::Normal)]
     effort: HowHard,
     /// How `--preset paper` compares picture and render. Default: mae. `gmsd` implies `--stride 1`.
