@@ -36,12 +36,7 @@ fn weights_of(group: u32) -> u32 {
     return slots[params.first_group + group] * params.weight_stride;
 }
 
-// Columns are rows of d_x.
-fn outer(row: vec4<f32>, column: vec4<f32>) -> mat4x4<f32> {
-    return mat4x4(column * row.x, column * row.y, column * row.z, column * row.w);
-}
-
-// What an invocation computes: rows 4 ly and 32 + 4 ly, a and b, input features 4 lx and 32 + 4 lx.
+// What an invocation computes: rows 4 ly and 32 + 4 ly, a and b, input features 4 lx and 32 + 4 lx; columns are rows of d_x.
 struct Sums {
     aa: mat4x4<f32>,
     ab: mat4x4<f32>,
@@ -49,17 +44,29 @@ struct Sums {
     bb: mat4x4<f32>,
 }
 
-// Adds the products of feature k of the sixteen.
+// Adds the products of feature k of the sixteen, a row after the other: eight that share a factor, which NVIDIA's GPUs then read once, are faster than four.
 fn multiply_add(sums: ptr<function, Sums>, local: vec2<u32>, k: u32) {
     let crossed = 2u * (k / 4u);
     let ya = y_tile[k][local.y ^ crossed];
     let yb = y_tile[k][(local.y + 8u) ^ crossed];
     let wa = w_tile[k][local.x];
     let wb = w_tile[k][local.x + 8u];
-    (*sums).aa += outer(ya, wa);
-    (*sums).ab += outer(ya, wb);
-    (*sums).ba += outer(yb, wa);
-    (*sums).bb += outer(yb, wb);
+    (*sums).aa[0] += wa * ya[0];
+    (*sums).ab[0] += wb * ya[0];
+    (*sums).aa[1] += wa * ya[1];
+    (*sums).ab[1] += wb * ya[1];
+    (*sums).aa[2] += wa * ya[2];
+    (*sums).ab[2] += wb * ya[2];
+    (*sums).aa[3] += wa * ya[3];
+    (*sums).ab[3] += wb * ya[3];
+    (*sums).ba[0] += wa * yb[0];
+    (*sums).bb[0] += wb * yb[0];
+    (*sums).ba[1] += wa * yb[1];
+    (*sums).bb[1] += wb * yb[1];
+    (*sums).ba[2] += wa * yb[2];
+    (*sums).bb[2] += wb * yb[2];
+    (*sums).ba[3] += wa * yb[3];
+    (*sums).bb[3] += wb * yb[3];
 }
 
 fn put(part: u32, row: u32, in_: u32, sum: vec4<f32>) {

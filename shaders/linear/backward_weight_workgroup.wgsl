@@ -24,12 +24,6 @@ struct Params {
 // Sixteen rows of a tile, each of 64 output features and of 64 input features, in vectors of four.
 var<workgroup> y_tile: array<vec4<f32>, 256>;
 var<workgroup> x_tile: array<vec4<f32>, 256>;
-
-// Columns are rows of the weight.
-fn outer(row: vec4<f32>, column: vec4<f32>) -> mat4x4<f32> {
-    return mat4x4(column * row.x, column * row.y, column * row.z, column * row.w);
-}
-
 // What an invocation computes: output features 4 ly and 32 + 4 ly, a and b, input features 4 lx and 32 + 4 lx, and the sums over rows of d_y.
 struct Sums {
     aa: mat4x4<f32>,
@@ -46,10 +40,22 @@ fn multiply_add(sums: ptr<function, Sums>, local: vec3<u32>, k: u32) {
     let yb = y_tile[16u * k + local.y + 8u];
     let xa = x_tile[16u * k + local.x];
     let xb = x_tile[16u * k + local.x + 8u];
-    (*sums).aa += outer(ya, xa);
-    (*sums).ab += outer(ya, xb);
-    (*sums).ba += outer(yb, xa);
-    (*sums).bb += outer(yb, xb);
+    (*sums).aa[0] += xa * ya[0];
+    (*sums).ab[0] += xb * ya[0];
+    (*sums).aa[1] += xa * ya[1];
+    (*sums).ab[1] += xb * ya[1];
+    (*sums).aa[2] += xa * ya[2];
+    (*sums).ab[2] += xb * ya[2];
+    (*sums).aa[3] += xa * ya[3];
+    (*sums).ab[3] += xb * ya[3];
+    (*sums).ba[0] += xa * yb[0];
+    (*sums).bb[0] += xb * yb[0];
+    (*sums).ba[1] += xa * yb[1];
+    (*sums).bb[1] += xb * yb[1];
+    (*sums).ba[2] += xa * yb[2];
+    (*sums).bb[2] += xb * yb[2];
+    (*sums).ba[3] += xa * yb[3];
+    (*sums).bb[3] += xb * yb[3];
     (*sums).a += ya;
     (*sums).b += yb;
 }

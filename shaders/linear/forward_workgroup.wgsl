@@ -36,12 +36,7 @@ fn weights_of(group: u32) -> u32 {
     return slots[params.first_group + group] * params.weight_stride;
 }
 
-// Columns are rows of y.
-fn outer(row: vec4<f32>, column: vec4<f32>) -> mat4x4<f32> {
-    return mat4x4(column * row.x, column * row.y, column * row.z, column * row.w);
-}
-
-// What an invocation computes: rows 4 ly and 32 + 4 ly, a and b, output features 4 lx and 32 + 4 lx.
+// What an invocation computes: rows 4 ly and 32 + 4 ly, a and b, output features 4 lx and 32 + 4 lx; columns are rows of y.
 struct Sums {
     aa: mat4x4<f32>,
     ab: mat4x4<f32>,
@@ -49,17 +44,29 @@ struct Sums {
     bb: mat4x4<f32>,
 }
 
-// Adds the products of feature k of the sixteen.
+// Adds the products of feature k of the sixteen, a row after the other: eight that share a factor, which NVIDIA's GPUs then read once, are faster than four.
 fn multiply_add(sums: ptr<function, Sums>, local: vec2<u32>, k: u32) {
     let crossed = 2u * (k / 4u);
     let xa = x_tile[k][local.y ^ crossed];
     let xb = x_tile[k][(local.y + 8u) ^ crossed];
     let wa = w_tile[k][local.x ^ crossed];
     let wb = w_tile[k][(local.x + 8u) ^ crossed];
-    (*sums).aa += outer(xa, wa);
-    (*sums).ab += outer(xa, wb);
-    (*sums).ba += outer(xb, wa);
-    (*sums).bb += outer(xb, wb);
+    (*sums).aa[0] += wa * xa[0];
+    (*sums).ab[0] += wb * xa[0];
+    (*sums).aa[1] += wa * xa[1];
+    (*sums).ab[1] += wb * xa[1];
+    (*sums).aa[2] += wa * xa[2];
+    (*sums).ab[2] += wb * xa[2];
+    (*sums).aa[3] += wa * xa[3];
+    (*sums).ab[3] += wb * xa[3];
+    (*sums).ba[0] += wa * xb[0];
+    (*sums).bb[0] += wb * xb[0];
+    (*sums).ba[1] += wa * xb[1];
+    (*sums).bb[1] += wb * xb[1];
+    (*sums).ba[2] += wa * xb[2];
+    (*sums).bb[2] += wb * xb[2];
+    (*sums).ba[3] += wa * xb[3];
+    (*sums).bb[3] += wb * xb[3];
 }
 
 fn put(group: u32, row: u32, out: u32, sum: vec4<f32>) {

@@ -43,6 +43,8 @@ pub enum Requirement {
     /// Every parameter named `features`, `in_features`, `out_features` or `chunk_outs` is a multiple of 4 (f32
     /// buffers may be read as `vec4<f32>`).
     FeaturesMultipleOf4,
+    /// None of those parameters exceeds 64.
+    FeaturesAtMost64,
     /// None of those parameters exceeds 256.
     FeaturesAtMost256,
     /// None of those parameters exceeds 1024.

@@ -156,6 +156,23 @@ params! {
         /// 1: add to the output, 0: overwrite it (`backward_input`).
         accumulate: u32,
     }
+    /// `hidden_layer/*`.
+    HiddenLayerParams {
+        /// Groups of rows; each has one set of weights.
+        groups: u32,
+        /// Rows of each group.
+        rows_per_group: u32,
+        /// Number of the first group: group `g` uses the weights `slots[first_group + g]`.
+        first_group: u32,
+        /// Values per input row.
+        in_features: u32,
+        /// Values per output row.
+        out_features: u32,
+        /// Distance between two sets of weights, in elements; 0 where all groups share one.
+        weight_stride: u32,
+        /// 1: the rows that the norm reads have no mean, as in `LayerNormParams`.
+        centred: u32,
+    }
     /// `layer_norm_relu/*`.
     LayerNormParams {
         /// Rows.

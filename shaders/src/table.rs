@@ -123,6 +123,16 @@ table! {
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32),
         or "backward_affine_vec4" tile [256, 1, 1], when [FeaturesMultipleOf4],
         or "backward_affine_workgroup" tile [32, 1, 1], when [FeaturesMultipleOf4];
+    /// `linear/forward` and then `layer_norm_relu/forward` of what it makes, `z`. No plan has this step: a device that is faster so joins the two.
+    /// `x [rows, in]`, `affine [2, out]` → `z, y [rows, out]`, `stats [rows, 2]`. Extent: rows of a group × 1 × groups.
+    HIDDEN_LAYER_FORWARD = "hidden_layer"/"forward", HiddenLayerParams, tile FLAT,
+        (x: f32, weights: f32, slots: u32, affine: f32) -> (z: f32, y: f32, stats: f32),
+        or "forward_workgroup" tile [32, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost64];
+    /// `linear/backward_input` and then `layer_norm_relu/backward_input` of the layer before, likewise: from the gradient `d_z` of this layer to
+    /// `d_y` and `d_z` of that one, which has as many features and takes the place of this one's. `x` is what the norm of that one read. Extent: rows of a group × 1 × groups.
+    HIDDEN_LAYER_BACKWARD_INPUT = "hidden_layer"/"backward_input", HiddenLayerParams, tile FLAT,
+        (weights: f32, slots: u32, x: f32, stats: f32, affine: f32) -> (d_y: f32, d_z: f32),
+        or "backward_input_workgroup" tile [32, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost64];
     /// The first layer of a network of points, where no weight takes a gradient: linear map, layer norm and ReLU in one, and nothing kept.
     /// `z = W x + b`, `y = relu(gamma (z - mean) rstd + beta)`; `x [rows, 3]`, `affine [2, features]` → `y [rows, features]`.
     /// Extent: rows of a group × 1 × groups.

@@ -40,9 +40,10 @@ fn every_kernel_validates() {
             Requirement::CooperativeMatrices => {
                 Capabilities::SUBGROUP | Capabilities::SHADER_FLOAT16 | Capabilities::COOPERATIVE_MATRIX
             }
-            Requirement::FeaturesMultipleOf4 | Requirement::FeaturesAtMost256 | Requirement::FeaturesAtMost1024 => {
-                Capabilities::empty()
-            }
+            Requirement::FeaturesMultipleOf4
+            | Requirement::FeaturesAtMost64
+            | Requirement::FeaturesAtMost256
+            | Requirement::FeaturesAtMost1024 => Capabilities::empty(),
         });
         let capabilities = capabilities.fold(Capabilities::empty(), |all, one| all | one);
         if let Err(error) = Validator::new(ValidationFlags::all(), Capabilities::default() | capabilities).validate(&module) {

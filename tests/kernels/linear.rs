@@ -75,7 +75,7 @@ pub static BACKWARD_INPUT: KernelTest = KernelTest {
         ("backward_input_workgroup", "number / workgroups.y", "number / workgroups.x"),
         ("backward_input_workgroup", "first + index % 4u <= last", "first + index % 4u <= last + 1u"),
         ("backward_input_workgroup", "multiply_add(&sums, local, 13u)", "multiply_add(&sums, local, 12u)"),
-        ("backward_input_workgroup", "ab += outer(ya, wb)", "ab += outer(ya, wa)"),
+        ("backward_input_workgroup", "ab[0] += wb * ya[0]", "ab[0] += wa * ya[0]"),
         ("backward_input_workgroup", "accumulate == 1u", "accumulate == 0u"),
         ("backward_input_subgroup", "o = begin / 4u", "o = 0u"),
         ("backward_input_subgroup", "slots[params.first_group + group]", "slots[group]"),

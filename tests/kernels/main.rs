@@ -19,6 +19,7 @@ mod depth_loss;
 mod embedding;
 mod executor;
 mod gmsd;
+mod hidden_layer;
 mod image_loss;
 mod latent_loss;
 mod layer_norm_relu;
@@ -62,6 +63,8 @@ static ALL: &[&KernelTest] = &[
     &layer_norm_relu::FORWARD,
     &layer_norm_relu::BACKWARD_INPUT,
     &layer_norm_relu::BACKWARD_AFFINE,
+    &hidden_layer::FORWARD,
+    &hidden_layer::BACKWARD_INPUT,
     &point_layer::FORWARD,
     &point_layer::BACKWARD_INPUT,
     &lstm_cell::FORWARD,

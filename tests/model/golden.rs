@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use sigma_srn::{Engine, Metadata, Model};
+use srn_gpu::Choice;
 use srn_tests::golden::{Figure, Limits, check, check_model};
 use srn_tests::gpu;
 
@@ -43,6 +44,12 @@ macro_rules! files {
             #[test]
             fn on_gpu() {
                 passes(stringify!($file), Engine::gpu(gpu().clone()), Limits::F32);
+            }
+
+            #[test]
+            fn on_gpu_with_joined_layers() {
+                let gpu = gpu().with_choice(Choice::Named("hidden_layer".into()));
+                passes(stringify!($file), Engine::gpu(gpu), Limits::F32);
             }
         })*
 

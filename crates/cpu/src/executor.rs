@@ -511,6 +511,8 @@ references! {
         "rays/backward" => rays::backward(f f f f f f) -> (f_mut);
         "embedding/forward" => embedding::forward(f u) -> (f_mut);
         "embedding/backward" => embedding::backward(u f) -> (f_mut);
+        "hidden_layer/forward" => hidden_layer::forward(f f u f) -> (f_mut f_mut f_mut);
+        "hidden_layer/backward_input" => hidden_layer::backward_input(f u f f f) -> (f_mut f_mut);
         "depth_loss/forward" => depth_loss::forward(f) -> (f_mut);
         "latent_loss/forward" => latent_loss::forward(f) -> (f_mut);
         "latent_loss/backward" => latent_loss::backward(f) -> (f_mut);

@@ -10,7 +10,7 @@ use srn_plan::{ExecutorError, Step};
 use srn_shaders::{Requirement, Variant};
 
 use crate::Gpu;
-use crate::executor::Launch;
+use crate::executor::{Bound, Launch, Scratch};
 use crate::gpu::lock;
 use crate::launch::MOST_FLOPS;
 
@@ -31,7 +31,8 @@ pub enum Choice {
         /// The folder of the file `variants.txt`. One that cannot be read or written is as good as none.
         cache: Option<PathBuf>,
     },
-    /// The variant of this name, or with this ending, where a kernel has it and size and device allow it, else the plain form: for tests.
+    /// The variant of this name, or with this ending, where a kernel has it and size and device allow it, else the plain form: for tests. Or an op
+    /// that does two steps in one, `hidden_layer`: wherever it can.
     Named(String),
 }
 
@@ -54,14 +55,19 @@ pub fn cache_folder() -> Option<PathBuf> {
 pub(crate) struct Chooser {
     choice: Choice,
     chosen: Mutex<HashMap<Shape, &'static Variant>>,
+    /// Of ops that do two steps in one; `None` where these are faster one after the other.
+    joined: Mutex<HashMap<Shape, Option<&'static Variant>>>,
 }
+
+/// What is kept where two steps are faster one after the other.
+const APART: &str = "apart";
 
 /// A kernel, whether it may use cooperative matrices, the widths of a step, and its extent up to the next power of two.
 type Shape = (&'static str, bool, Vec<u32>);
 
 impl Chooser {
     pub fn new(choice: Choice) -> Self {
-        Chooser { choice, chosen: Mutex::default() }
+        Chooser { choice, ..Chooser::default() }
     }
 
     pub fn choice(&self) -> &Choice {
@@ -93,53 +99,107 @@ impl Chooser {
         Chooser::new(self.choice.clone())
     }
 
-    /// The variant for a step; `launch` makes the step with a variant and a part of its extent ready to be timed.
-    pub fn choose(
-        &self,
-        gpu: &Gpu,
-        step: &Step,
-        launch: impl Fn(&Variant, [u32; 3]) -> Result<Launch, ExecutorError>,
-    ) -> Result<&'static Variant, ExecutorError> {
-        let cooperative = gpu.cooperative().is_some();
-        let shape = (step.kernel.name, cooperative, widths(step).chain(step.extent.map(u32::next_power_of_two)).collect());
+    /// The variant for a step.
+    pub fn choose(&self, bound: &Bound<'_>) -> Result<&'static Variant, ExecutorError> {
+        let (gpu, step) = (bound.gpu, bound.step);
+        let shape = shape(gpu, step);
         // Held while measuring: two plans that are built at once would spoil each other's times.
         let mut chosen = lock(&self.chosen);
         if let Some(variant) = chosen.get(&shape) {
             return Ok(variant);
         }
-        let usable: Vec<&'static Variant> = step.kernel.variants.iter().filter(|variant| is_usable(variant, step, gpu)).collect();
+        let usable = usable(gpu, step);
         let variant = match &self.choice {
             _ if usable.len() == 1 => usable[0],
             Choice::Measured { .. } if !gpu.can_time() => usable[0],
             Choice::Named(name) => usable.iter().find(|variant| variant.name.ends_with(name)).unwrap_or(&usable[0]),
             Choice::Measured { .. } => {
-                let texts: Vec<String> = usable.iter().map(|variant| gpu.source(step.kernel, variant)).collect();
-                let key = key(&format!("{} {shape:?} {texts:?}", gpu.identity()));
-                let kept = || {
-                    let label = self.remembered(&key)?;
-                    usable.iter().copied().find(|variant| step.kernel.label(variant) == label)
-                };
-                match kept() {
-                    Some(variant) => variant,
-                    None => {
-                        let fastest = measure(gpu, step, &usable, launch)?;
-                        // What another process has chosen meanwhile holds for both.
-                        kept().unwrap_or_else(|| {
-                            self.remember(&key, &step.kernel.label(fastest));
-                            fastest
-                        })
-                    }
-                }
+                let label = self.kept_or(gpu, step, &shape, &usable, || {
+                    let fastest = measure(bound, &usable)?;
+                    Ok(step.kernel.label(fastest))
+                })?;
+                usable.iter().copied().find(|variant| step.kernel.label(variant) == label).unwrap_or(usable[0])
             }
         };
         chosen.insert(shape, variant);
         Ok(variant)
     }
+
+    /// The variant of a step that does the work of two, where that is faster than these by the variants chosen for them.
+    pub fn choose_joined(
+        &self,
+        joined: &Bound<'_>,
+        apart: [(&Bound<'_>, &Variant); 2],
+    ) -> Result<Option<&'static Variant>, ExecutorError> {
+        let (gpu, step) = (joined.gpu, joined.step);
+        let shape = shape(gpu, step);
+        let mut chosen = lock(&self.joined);
+        if let Some(&variant) = chosen.get(&shape) {
+            return Ok(variant);
+        }
+        // The plain form is for nothing but to be compared with. What is one dispatch less on a device is nothing to the threads of a processor.
+        let usable = usable(gpu, step);
+        let fast = usable.get(1).copied().filter(|_| gpu.can_time() && !gpu.adapter().is_software);
+        let variant = match (&self.choice, fast) {
+            (Choice::Named(name), _) => usable.last().copied().filter(|_| name == step.kernel.op),
+            (Choice::Measured { .. }, None) => None,
+            (Choice::Measured { .. }, Some(fast)) => {
+                let label = self.kept_or(gpu, step, &shape, &usable, || {
+                    let scratch = Scratch::of(&[joined, apart[0].0, apart[1].0])?;
+                    let [first, second] = apart.map(|(bound, variant)| bound.trial(variant, bound.step.extent, &scratch));
+                    let candidates = vec![
+                        Candidate::new(APART, vec![first?, second?]),
+                        Candidate::new(fast.name, vec![joined.trial(fast, step.extent, &scratch)?]),
+                    ];
+                    let fastest = fastest(joined, candidates, 1)?;
+                    Ok(if fastest == APART { APART.into() } else { step.kernel.label(fast) })
+                })?;
+                (label != APART).then_some(fast)
+            }
+        };
+        chosen.insert(shape, variant);
+        Ok(variant)
+    }
+
+    /// What was kept for a shape, else what `find` finds, which is kept then. Words that are of no use any more are found anew.
+    fn kept_or(
+        &self,
+        gpu: &Gpu,
+        step: &Step,
+        shape: &Shape,
+        usable: &[&'static Variant],
+        find: impl FnOnce() -> Result<String, ExecutorError>,
+    ) -> Result<String, ExecutorError> {
+        let texts: Vec<String> = usable.iter().map(|variant| gpu.source(step.kernel, variant)).collect();
+        let key = key(&format!("{} {shape:?} {texts:?}", gpu.identity()));
+        let is_known = |word: &String| word == APART || usable.iter().any(|variant| &step.kernel.label(variant) == word);
+        let kept = || self.remembered(&key).filter(is_known);
+        if let Some(word) = kept() {
+            return Ok(word);
+        }
+        let found = find()?;
+        // What another process has chosen meanwhile holds for both.
+        Ok(kept().unwrap_or_else(|| {
+            self.remember(&key, &found);
+            found
+        }))
+    }
+}
+
+fn shape(gpu: &Gpu, step: &Step) -> Shape {
+    let cooperative = gpu.cooperative().is_some();
+    (step.kernel.name, cooperative, widths(step).chain(step.extent.map(u32::next_power_of_two)).collect())
+}
+
+/// The variants that a step can run, the plain one first.
+fn usable(gpu: &Gpu, step: &Step) -> Vec<&'static Variant> {
+    step.kernel.variants.iter().filter(|variant| is_usable(variant, step, gpu)).collect()
 }
 
 fn is_usable(variant: &Variant, step: &Step, gpu: &Gpu) -> bool {
     variant.requires.iter().all(|requirement| match requirement {
         Requirement::FeaturesMultipleOf4 => widths(step).all(|width| width % 4 == 0),
+        Requirement::FeaturesAtMost64 => widths(step).all(|width| width <= 64),
         Requirement::FeaturesAtMost256 => widths(step).all(|width| width <= 256),
         Requirement::FeaturesAtMost1024 => widths(step).all(|width| width <= 1024),
         Requirement::Subgroups => gpu.has_subgroups(),
@@ -168,15 +228,19 @@ const MOST_ROUNDS: usize = 20;
 /// Times that differ by less are the same.
 const SAME: f64 = 1.1;
 
-/// A variant with its times so far, the two shortest of them.
+/// One way to do the work, by one launch or several, with its times so far, the two shortest of them.
 struct Candidate {
-    variant: &'static Variant,
-    launch: Launch,
+    name: &'static str,
+    launches: Vec<Launch>,
     best: f64,
     second: f64,
 }
 
 impl Candidate {
+    fn new(name: &'static str, launches: Vec<Launch>) -> Self {
+        Candidate { name, launches, best: f64::INFINITY, second: f64::INFINITY }
+    }
+
     fn add(&mut self, seconds: f64) {
         self.second = self.second.min(seconds.max(self.best));
         self.best = self.best.min(seconds);
@@ -188,38 +252,46 @@ impl Candidate {
     }
 }
 
-fn measure(
-    gpu: &Gpu,
-    step: &Step,
-    usable: &[&'static Variant],
-    launch: impl Fn(&Variant, [u32; 3]) -> Result<Launch, ExecutorError>,
-) -> Result<&'static Variant, ExecutorError> {
+fn measure(bound: &Bound<'_>, usable: &[&'static Variant]) -> Result<&'static Variant, ExecutorError> {
+    let step = bound.step;
     let (mut extent, mut flops) = (step.extent, step.flops);
-    let most = if gpu.adapter().is_software { SAMPLE } else { MOST_FLOPS };
+    let most = if bound.gpu.adapter().is_software { SAMPLE } else { MOST_FLOPS };
     while flops > most {
         // The rows of a group, or the groups; both for sums over rows.
         let longest = if extent[0] >= extent[2] { 0 } else { 2 };
         extent[longest] = extent[longest].div_ceil(2);
         flops /= 2;
     }
+    let scratch = Scratch::of(&[bound])?;
     let mut candidates = Vec::new();
     for &variant in usable {
-        match launch(variant, extent) {
-            Ok(launch) => candidates.push(Candidate { variant, launch, best: f64::INFINITY, second: f64::INFINITY }),
+        match bound.trial(variant, extent, &scratch) {
+            Ok(launch) => candidates.push(Candidate::new(variant.name, vec![launch])),
             Err(error) => tracing::debug!(%error, "not a candidate"),
         }
     }
-    if let [] | [_] = candidates[..] {
-        return Ok(candidates.first().map_or(usable[0], |only| only.variant));
-    }
-    // As many side by side as a submission may have.
-    let at_once = (MOST_FLOPS / flops.max(1)).max(1) as usize;
-    let time = |launches: &[&Launch]| {
-        let parts = launches.chunks(at_once).map(|part| gpu.time(part)).collect::<Result<Vec<_>, _>>();
-        parts.map(|parts| parts.concat())
+    let fastest = match &candidates[..] {
+        [] => return Ok(usable[0]),
+        [only] => only.name,
+        // As many side by side as a submission may have.
+        _ => fastest(bound, candidates, (MOST_FLOPS / flops.max(1)).max(1) as usize)?,
+    };
+    Ok(usable.iter().copied().find(|variant| variant.name == fastest).unwrap_or(usable[0]))
+}
+
+/// The name of the candidate that takes the shortest time, in submissions of `at_once` of them.
+fn fastest(bound: &Bound<'_>, mut candidates: Vec<Candidate>, at_once: usize) -> Result<&'static str, ExecutorError> {
+    let (gpu, step) = (bound.gpu, bound.step);
+    let time = |candidates: &[&mut Candidate]| -> Result<Vec<f64>, ExecutorError> {
+        let mut times = Vec::new();
+        for part in candidates.chunks(at_once) {
+            let mut seconds = gpu.time(&part.iter().flat_map(|candidate| &candidate.launches).collect::<Vec<_>>())?.into_iter();
+            times.extend(part.iter().map(|candidate| seconds.by_ref().take(candidate.launches.len()).sum::<f64>()));
+        }
+        Ok(times)
     };
     // The first time is that of compiling.
-    time(&candidates.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
+    time(&candidates.iter_mut().collect::<Vec<_>>())?;
     for _ in 0..MOST_ROUNDS {
         let best = candidates.iter().map(|candidate| candidate.best).fold(f64::INFINITY, f64::min);
         let is_open = |candidate: &&mut Candidate| !(candidate.is_settled() && candidate.best > SAME * best);
@@ -227,17 +299,14 @@ fn measure(
         if open.len() <= 1 || (best.is_finite() && open.iter().all(|candidate| candidate.is_settled())) {
             break;
         }
-        let seconds = time(&open.iter().map(|candidate| &candidate.launch).collect::<Vec<_>>())?;
+        let seconds = time(&open)?;
         open.iter_mut().zip(seconds).for_each(|(candidate, seconds)| candidate.add(seconds));
     }
-    let fastest = candidates.iter().min_by(|a, b| a.best.total_cmp(&b.best)).map_or(usable[0], |fastest| fastest.variant);
-    let times = candidates.iter().map(|candidate| format!("{} {:.3} ms", candidate.variant.name, 1e3 * candidate.best));
-    tracing::debug!(
-        kernel = step.kernel.name,
-        widths = ?widths(step).collect::<Vec<_>>(),
-        extent = ?step.extent,
-        "chose {}: {}", fastest.name, times.collect::<Vec<_>>().join(", ")
-    );
+    let times = candidates.iter().map(|candidate| format!("{} {:.3} ms", candidate.name, 1e3 * candidate.best));
+    let times = times.collect::<Vec<_>>().join(", ");
+    let fastest = candidates.iter().min_by(|a, b| a.best.total_cmp(&b.best)).map_or("", |fastest| fastest.name);
+    let widths: Vec<u32> = widths(step).collect();
+    tracing::debug!(kernel = step.kernel.name, ?widths, extent = ?step.extent, "chose {fastest}: {times}");
     Ok(fastest)
 }
 

@@ -1,8 +1,12 @@
-use std::cell::{OnceCell, RefCell};
-use std::collections::HashMap;
+use std::cell::RefCell;
+use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, HashMap};
+use std::iter;
+use std::ops::Range;
 use std::sync::Arc;
 
 use bytemuck::Pod;
+use srn_plan::ops::hidden_layer;
 use srn_plan::{BufferId, Element, Executor, ExecutorError, Plan, StageId, Step};
 use srn_shaders::Variant;
 
@@ -27,12 +31,34 @@ impl Launch {
     }
 }
 
+/// The steps of a stage, ready to be dispatched.
+struct Stage {
+    /// Each by itself.
+    alone: Vec<Launch>,
+    /// Two in one, where that is faster; by the number of the first of them.
+    joined: BTreeMap<usize, Launch>,
+}
+
+impl Stage {
+    /// What runs a part of the steps, each with the numbers of those that it does.
+    fn launches(&self, part: Range<usize>) -> impl Iterator<Item = (Range<usize>, &Launch)> {
+        let mut next = part.start;
+        iter::from_fn(move || {
+            let first = next;
+            let alone = self.alone.get(first).filter(|_| first < part.end)?;
+            let both = self.joined.get(&first).filter(|_| first + 1 < part.end);
+            next = first + if both.is_some() { 2 } else { 1 };
+            Some((first..next, both.unwrap_or(alone)))
+        })
+    }
+}
+
 /// A plan on a device: its buffers (zero at first), and its steps ready to run.
 pub struct GpuExecutor {
     gpu: Gpu,
     plan: Plan,
     buffers: Vec<wgpu::Buffer>,
-    stages: Vec<Vec<Launch>>,
+    stages: Vec<Stage>,
     /// After a failed run the buffers hold anything: every later call answers with this.
     failure: Option<ExecutorError>,
 }
@@ -40,7 +66,7 @@ pub struct GpuExecutor {
 impl GpuExecutor {
     /// Makes buffers, pipelines and bind groups for `plan`, whose buffers may take `budget` bytes in all.
     ///
-    /// Where a step can run several variants of its kernel, the device's [`Choice`](crate::Choice) decides.
+    /// Where a step can run several variants of its kernel, or two steps can be one, the device's [`Choice`](crate::Choice) decides.
     ///
     /// Fails where the plan exceeds the budget or a limit of the device, where a kernel does not compile, or a step needs
     /// more workgroups than the device allows.
@@ -65,22 +91,33 @@ impl GpuExecutor {
             };
             plan.buffers.iter().map(make).collect::<Vec<_>>()
         })?;
-        let params = Params::upload(gpu, plan.stages.iter().flat_map(|stage| &stage.steps))?;
+        let joined = plan.stages.iter().map(|stage| {
+            let pairs = stage.steps.windows(2).enumerate();
+            pairs.filter_map(|(number, pair)| Some((number, hidden_layer::joined(&pair[0], &pair[1])?))).collect::<Vec<_>>()
+        });
+        let joined: Vec<_> = joined.collect();
+        let of_stages = plan.stages.iter().zip(&joined);
+        let params = Params::upload(
+            gpu,
+            of_stages.clone().flat_map(|(stage, joined)| stage.steps.iter().chain(joined.iter().map(|(_, step)| step))),
+        )?;
         let mut offsets = params.offsets.iter().copied();
         let pipelines = Pipelines::default();
+        let mut bind =
+            |step| Bound::new(gpu, &pipelines, step, &buffers, params.binding(step, offsets.next().unwrap_or_default()));
         let mut stages = Vec::new();
-        for stage in &plan.stages {
-            let mut launches = Vec::with_capacity(stage.steps.len());
-            for step in &stage.steps {
-                let bound: Vec<&wgpu::Buffer> = step.buffers.iter().map(|id| &buffers[id.index()]).collect();
-                let params = params.binding(step, offsets.next().unwrap_or_default());
-                let scratch = Scratch::default();
-                let variant = gpu.chooser().choose(gpu, step, |variant, extent| {
-                    launch(gpu, &pipelines, step, variant, extent, &scratch.instead_of_outputs(gpu, step, &bound)?, &params)
-                })?;
-                launches.push(launch(gpu, &pipelines, step, variant, step.extent, &bound, &params)?);
+        for (stage, joined) in of_stages {
+            let steps: Vec<Bound<'_>> = stage.steps.iter().map(&mut bind).collect();
+            let variants = steps.iter().map(|step| gpu.chooser().choose(step)).collect::<Result<Vec<_>, _>>()?;
+            let alone = steps.iter().zip(&variants).map(|(step, variant)| step.launch(variant)).collect::<Result<_, _>>()?;
+            let mut made = BTreeMap::new();
+            for (number, step) in joined {
+                let (step, apart) = (bind(step), [0, 1].map(|k| (&steps[number + k], variants[number + k])));
+                if let Some(variant) = gpu.chooser().choose_joined(&step, apart)? {
+                    made.insert(*number, step.launch(variant)?);
+                }
             }
-            stages.push(launches);
+            stages.push(Stage { alone, joined: made });
         }
         Ok(GpuExecutor { gpu: gpu.clone(), plan, buffers, stages, failure: None })
     }
@@ -95,15 +132,16 @@ impl GpuExecutor {
         &self.buffers[id.index()]
     }
 
-    /// The kernel variant that a step runs, as `op/variant`.
+    /// The kernel variant that a step runs by itself, as `op/variant`.
     pub fn label(&self, stage: StageId, step: usize) -> &str {
-        &self.stages[stage.index()][step].label
+        &self.stages[stage.index()].alone[step].label
     }
 
     /// Appends all steps of a stage to the caller's encoder, as one compute pass. Its errors appear where the caller
     /// finishes and submits the encoder.
     pub fn encode(&self, stage: StageId, encoder: &mut wgpu::CommandEncoder) {
-        encode(&self.stages[stage.index()], &self.plan.stage(stage).name, encoder);
+        let steps = 0..self.plan.stage(stage).steps.len();
+        encode(self.launches(stage, steps).map(|(_, launch)| launch), &self.plan.stage(stage).name, encoder);
     }
 
     /// Fails where an earlier run did; else does `work`, and remembers its failure.
@@ -116,11 +154,12 @@ impl GpuExecutor {
         result
     }
 
-    pub(crate) fn launches(&self, stage: StageId) -> &[Launch] {
-        &self.stages[stage.index()]
+    /// What runs a part of a stage's steps, each with the numbers of those that it does.
+    pub(crate) fn launches(&self, stage: StageId, part: Range<usize>) -> impl Iterator<Item = (Range<usize>, &Launch)> {
+        self.stages[stage.index()].launches(part)
     }
 
-    fn submit(&self, launches: &[Launch], label: &str) -> Result<(), ExecutorError> {
+    fn submit<'a>(&self, launches: impl Iterator<Item = &'a Launch>, label: &str) -> Result<(), ExecutorError> {
         self.gpu.checked(label, || {
             let mut encoder = self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some(label) });
             encode(launches, label, &mut encoder);
@@ -170,14 +209,15 @@ impl Executor for GpuExecutor {
     fn run(&mut self, stage: StageId) -> Result<(), ExecutorError> {
         self.attempt(|this| {
             let plan = this.plan.stage(stage);
-            launch::submissions(&plan.steps).into_iter().try_for_each(|part| this.submit(&this.launches(stage)[part], &plan.name))
+            let mut parts = launch::submissions(&plan.steps).into_iter();
+            parts.try_for_each(|part| this.submit(this.launches(stage, part).map(|(_, launch)| launch), &plan.name))
         })
     }
 
     fn run_step(&mut self, stage: StageId, step: usize) -> Result<(), ExecutorError> {
         self.attempt(|this| {
-            let launch = &this.launches(stage)[step];
-            this.submit(std::slice::from_ref(launch), &launch.label)
+            let launch = &this.stages[stage.index()].alone[step];
+            this.submit(iter::once(launch), &launch.label)
         })
     }
 
@@ -195,77 +235,100 @@ impl Executor for GpuExecutor {
 }
 
 /// One pass for all: wgpu puts a barrier between two dispatches where the second reads what the first wrote.
-fn encode(launches: &[Launch], label: &str, encoder: &mut wgpu::CommandEncoder) {
+fn encode<'a>(launches: impl Iterator<Item = &'a Launch>, label: &str, encoder: &mut wgpu::CommandEncoder) {
     let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(label), timestamp_writes: None });
-    launches.iter().for_each(|launch| launch.dispatch(&mut pass));
+    launches.for_each(|launch| launch.dispatch(&mut pass));
 }
 
 /// The pipelines of a plan by their labels: the device knows them by their whole texts, which are long, and a plan has a thousand steps.
 type Pipelines = RefCell<HashMap<String, Arc<Pipeline>>>;
 
-/// Makes one dispatch: `bound` has a buffer for each binding of the kernel, `extent` is the step's or a part of it.
-fn launch(
-    gpu: &Gpu,
-    pipelines: &Pipelines,
-    step: &Step,
-    variant: &Variant,
-    extent: [u32; 3],
-    bound: &[&wgpu::Buffer],
-    params: &wgpu::BufferBinding<'_>,
-) -> Result<Launch, ExecutorError> {
-    let label = step.kernel.label(variant);
-    let most = gpu.device().limits().max_compute_workgroups_per_dimension;
-    let grid = launch::grid(extent, variant.tile, most).ok_or_else(|| ExecutorError::Device {
-        what: format!("{label}: extent {extent:?} in tiles of {:?} needs more than {most} workgroups", variant.tile),
-    })?;
-    let known = pipelines.borrow().get(&label).cloned();
-    let pipeline = match known {
-        Some(pipeline) => pipeline,
-        None => {
-            let made = gpu.pipeline(step.kernel, variant)?;
-            pipelines.borrow_mut().insert(label.clone(), made.clone());
-            made
-        }
-    };
-    let entry = |&(binding, slot): &(u32, Slot)| wgpu::BindGroupEntry {
-        binding,
-        resource: match slot {
-            Slot::Params => wgpu::BindingResource::Buffer(params.clone()),
-            Slot::Buffer(position) => bound[position].as_entire_binding(),
-        },
-    };
-    let entries: Vec<_> = pipeline.slots.iter().map(entry).collect();
-    let bind_group = gpu.checked(&label, || {
-        let descriptor = wgpu::BindGroupDescriptor { label: Some(&label), layout: &pipeline.layout, entries: &entries };
-        gpu.device().create_bind_group(&descriptor)
-    })?;
-    Ok(Launch { pipeline, bind_group, grid, label })
+/// A step with its buffers and parameters.
+pub(crate) struct Bound<'a> {
+    pub gpu: &'a Gpu,
+    pub step: &'a Step,
+    pipelines: &'a Pipelines,
+    /// One for each binding of the kernel.
+    buffers: Vec<&'a wgpu::Buffer>,
+    params: wgpu::BufferBinding<'a>,
 }
 
-/// Buffers that a step writes while its variants are measured, made when they are needed. What it reads are the plan's.
-#[derive(Default)]
-struct Scratch(OnceCell<Vec<Option<wgpu::Buffer>>>);
+impl<'a> Bound<'a> {
+    fn new(
+        gpu: &'a Gpu,
+        pipelines: &'a Pipelines,
+        step: &'a Step,
+        buffers: &'a [wgpu::Buffer],
+        params: wgpu::BufferBinding<'a>,
+    ) -> Self {
+        let buffers = step.buffers.iter().map(|id| &buffers[id.index()]).collect();
+        Bound { gpu, step, pipelines, buffers, params }
+    }
+
+    /// Its dispatch.
+    pub fn launch(&self, variant: &Variant) -> Result<Launch, ExecutorError> {
+        self.dispatch(variant, self.step.extent, &self.buffers)
+    }
+
+    /// A dispatch of a part of its extent, to be timed, with buffers of `scratch` for the plan's.
+    pub fn trial(&self, variant: &Variant, extent: [u32; 3], scratch: &Scratch) -> Result<Launch, ExecutorError> {
+        let buffers = self.step.buffers.iter().zip(&self.buffers);
+        let buffers: Vec<_> = buffers.map(|(id, &buffer)| scratch.0.get(&id.index()).unwrap_or(buffer)).collect();
+        self.dispatch(variant, extent, &buffers)
+    }
+
+    fn dispatch(&self, variant: &Variant, extent: [u32; 3], buffers: &[&wgpu::Buffer]) -> Result<Launch, ExecutorError> {
+        let (gpu, kernel) = (self.gpu, self.step.kernel);
+        let label = kernel.label(variant);
+        let most = gpu.device().limits().max_compute_workgroups_per_dimension;
+        let grid = launch::grid(extent, variant.tile, most).ok_or_else(|| ExecutorError::Device {
+            what: format!("{label}: extent {extent:?} in tiles of {:?} needs more than {most} workgroups", variant.tile),
+        })?;
+        let known = self.pipelines.borrow().get(&label).cloned();
+        let pipeline = match known {
+            Some(pipeline) => pipeline,
+            None => {
+                let made = gpu.pipeline(kernel, variant)?;
+                self.pipelines.borrow_mut().insert(label.clone(), made.clone());
+                made
+            }
+        };
+        let entry = |&(binding, slot): &(u32, Slot)| wgpu::BindGroupEntry {
+            binding,
+            resource: match slot {
+                Slot::Params => wgpu::BindingResource::Buffer(self.params.clone()),
+                Slot::Buffer(position) => buffers[position].as_entire_binding(),
+            },
+        };
+        let entries: Vec<_> = pipeline.slots.iter().map(entry).collect();
+        let bind_group = gpu.checked(&label, || {
+            let descriptor = wgpu::BindGroupDescriptor { label: Some(&label), layout: &pipeline.layout, entries: &entries };
+            gpu.device().create_bind_group(&descriptor)
+        })?;
+        Ok(Launch { pipeline, bind_group, grid, label })
+    }
+}
+
+/// Buffers for all that some steps write, by their numbers in the plan: to be measured they must spoil nothing, and read what one of them wrote.
+pub(crate) struct Scratch(BTreeMap<usize, wgpu::Buffer>);
 
 impl Scratch {
-    fn instead_of_outputs<'a>(
-        &'a self,
-        gpu: &Gpu,
-        step: &Step,
-        bound: &[&'a wgpu::Buffer],
-    ) -> Result<Vec<&'a wgpu::Buffer>, ExecutorError> {
-        if self.0.get().is_none() {
-            let made = gpu.checked("making buffers to measure with", || {
-                let make = |buffer: &wgpu::Buffer| {
-                    let (label, size, usage) = (Some("measurement"), buffer.size(), wgpu::BufferUsages::STORAGE);
-                    gpu.device().create_buffer(&wgpu::BufferDescriptor { label, size, usage, mapped_at_creation: false })
+    pub fn of(steps: &[&Bound<'_>]) -> Result<Self, ExecutorError> {
+        let mut made = BTreeMap::new();
+        for bound in steps {
+            let bindings = bound.step.kernel.bindings.iter().zip(&bound.step.buffers).zip(&bound.buffers);
+            for ((_, id), buffer) in bindings.filter(|((binding, _), _)| binding.written) {
+                let (label, size, usage) = (Some("measurement"), buffer.size(), wgpu::BufferUsages::STORAGE);
+                let make = || {
+                    let descriptor = wgpu::BufferDescriptor { label, size, usage, mapped_at_creation: false };
+                    bound.gpu.device().create_buffer(&descriptor)
                 };
-                let bindings = step.kernel.bindings.iter().zip(bound);
-                bindings.map(|(binding, buffer)| binding.written.then(|| make(buffer))).collect::<Vec<_>>()
-            })?;
-            let _ = self.0.set(made);
+                if let Entry::Vacant(place) = made.entry(id.index()) {
+                    place.insert(bound.gpu.checked("making buffers to measure with", make)?);
+                }
+            }
         }
-        let made = self.0.get().into_iter().flatten();
-        Ok(made.zip(bound).map(|(scratch, &buffer)| scratch.as_ref().unwrap_or(buffer)).collect())
+        Ok(Scratch(made))
     }
 }
 

@@ -4,7 +4,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use srn_plan::{ExecutorError, Kernel};
-use srn_shaders::{Cooperative, Requirement, TABLE, Variant};
+use srn_shaders::{Cooperative, HIDDEN_LAYER_FORWARD, Requirement, TABLE, Variant};
 
 use crate::choice::{Choice, Chooser, key};
 use crate::pipeline::Pipeline;
@@ -139,14 +139,15 @@ impl Gpu {
         format!("{} {TRANSLATOR} {features:?} {} {}", self.adapter(), info.subgroup_min_size, info.subgroup_max_size)
     }
 
-    /// The forms of kernels beside the plain ones that this device may run, as endings for [`Choice::Named`].
+    /// The forms of kernels beside the plain ones that this device may run, as names for [`Choice::Named`].
     pub fn forms(&self) -> BTreeSet<&'static str> {
         let may_run = |variant: &&Variant| match variant.requires {
             requires if requires.contains(&Requirement::CooperativeMatrices) => false,
             requires => self.has_subgroups() || !requires.contains(&Requirement::Subgroups),
         };
         let others = TABLE.iter().flat_map(|kernel| kernel.variants.iter().skip(1)).filter(may_run);
-        others.filter_map(|variant| variant.name.rsplit('_').next()).collect()
+        let joined = (!self.adapter().is_software).then_some(HIDDEN_LAYER_FORWARD.op);
+        others.filter_map(|variant| variant.name.rsplit('_').next()).chain(joined).collect()
     }
 
     pub(crate) fn chooser(&self) -> &Chooser {

@@ -11,7 +11,7 @@ use crate::{Gpu, GpuExecutor, launch};
 pub struct KernelTime {
     /// `op/variant`.
     pub label: String,
-    /// Number of steps.
+    /// Number of dispatches.
     pub steps: usize,
     /// Their time in all.
     pub seconds: f64,
@@ -34,15 +34,15 @@ impl GpuExecutor {
                 launch::submissions(&this.plan().stage(stage).steps).into_iter().map(move |part| (stage, part))
             });
             for (stage, part) in parts {
-                let launches: Vec<&Launch> = this.launches(stage)[part.clone()].iter().collect();
+                let (steps, launches): (Vec<_>, Vec<&Launch>) = this.launches(stage, part).unzip();
                 let seconds = this.gpu().time(&launches)?;
-                for (index, seconds) in part.zip(seconds) {
-                    let label = this.launches(stage)[index].label.as_str();
+                for ((steps, launch), seconds) in steps.into_iter().zip(launches).zip(seconds) {
+                    let label = launch.label.as_str();
                     let new = || KernelTime { label: label.into(), steps: 0, seconds: 0.0, flops: 0 };
                     let time = times.entry(label).or_insert_with(new);
                     time.steps += 1;
                     time.seconds += seconds;
-                    time.flops += this.plan().stage(stage).steps[index].flops;
+                    time.flops += this.plan().stage(stage).steps[steps].iter().map(|step| step.flops).sum::<u64>();
                 }
             }
             let mut times: Vec<_> = times.into_values().collect();

@@ -64,7 +64,7 @@ impl Layer {
         }
     }
 
-    fn params(&self, rows: Rows, accumulate: bool) -> LinearParams {
+    pub(super) fn params(&self, rows: Rows, accumulate: bool) -> LinearParams {
         LinearParams {
             groups: rows.groups,
             rows_per_group: rows.rows_per_group,
@@ -83,7 +83,7 @@ impl Layer {
 }
 
 /// Most loop iterations of an invocation that sums over `terms`: one for each and for each sixteen, and some to store.
-fn loops(terms: u32) -> u64 {
+pub(super) fn loops(terms: u32) -> u64 {
     u64::from(terms) + u64::from(terms) / 16 + 64
 }
 

@@ -11,6 +11,7 @@ pub mod depth;
 pub mod depth_loss;
 pub mod embedding;
 pub mod gmsd;
+pub mod hidden_layer;
 pub mod image_loss;
 pub mod latent_loss;
 pub mod layer_norm_relu;
