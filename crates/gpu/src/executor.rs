@@ -365,3 +365,46 @@ impl Params {
         Ok(Params { buffer, offsets })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use srn_plan::ops::layer_norm_relu::{self, Saved};
+    use srn_plan::ops::linear::{self, Layer, Sets};
+    use srn_plan::{Builder, Rows};
+
+    use super::*;
+    use crate::choice::is_faster;
+
+    /// A software adapter never asks; here it is timed all the same.
+    #[test]
+    fn two_steps_are_timed_against_one_and_nothing_is_spoilt() {
+        let gpu = Gpu::open(std::env::var("SIGMA_SRN_ADAPTER").ok().as_deref()).unwrap();
+        let (n, width) = (100, 32);
+        let mut b = Builder::new(u64::MAX);
+        let mut buffer = |name: &str, len: u32| b.input(name, len as usize).unwrap();
+        let [x, z, y] = ["x", "z", "y"].map(|name| buffer(name, n * width));
+        let (weights, affine, stats) =
+            (buffer("weights", (width + 1) * width), buffer("affine", 2 * width), buffer("stats", 2 * n));
+        let slots = b.input_u32("slots", 1).unwrap();
+        let layer = Layer { weights, in_features: width, out_features: width, sets: Sets::Shared };
+        let stage = b.stage("layer");
+        linear::forward(&mut b, Rows::plain(n), layer, x, slots, z, false).unwrap();
+        layer_norm_relu::forward(&mut b, n, width, Saved { x: z, stats, affine, centred: false }, y).unwrap();
+        let plan = b.finish().unwrap();
+
+        let mut executor = GpuExecutor::new(&gpu, plan.clone(), u64::MAX).unwrap();
+        let values: Vec<f32> = (0..n * width).map(|k| k as f32).collect();
+        executor.write(z, &values).unwrap();
+        let steps = &plan.stage(stage).steps;
+        let both = hidden_layer::joined(&steps[0], &steps[1]).unwrap();
+        let params = Params::upload(&gpu, steps.iter().chain([&both])).unwrap();
+        let pipelines = Pipelines::default();
+        let bind = |step, number: usize| {
+            Bound::new(&gpu, &pipelines, step, &executor.buffers, params.binding(step, params.offsets[number]))
+        };
+        let [first, second, both] = [(&steps[0], 0), (&steps[1], 1), (&both, 2)].map(|(step, number)| bind(step, number));
+        let plain = |bound: &Bound<'_>| &bound.step.kernel.variants[0];
+        is_faster(&both, &both.step.kernel.variants[1], [(&first, plain(&first)), (&second, plain(&second))]).unwrap();
+        assert_eq!(executor.read(z).unwrap(), values);
+    }
+}
