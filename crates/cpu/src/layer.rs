@@ -4,7 +4,7 @@ use std::cell::RefCell;
 
 use pulp::{Arch, Simd, WithSimd};
 
-use crate::aligned::{self, Aligned};
+use crate::aligned::Aligned;
 use crate::chain::{Kept, with_kept};
 
 /// Inputs at a time: their weights for as many outputs as have their sums in registers stay in the first cache.
@@ -240,7 +240,7 @@ impl Block<'_> {
 #[inline(always)]
 fn ask_for(values: &[f32]) {
     use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
-    for line in values.chunks(aligned::LINE / size_of::<f32>()) {
+    for line in values.chunks(crate::aligned::LINE / size_of::<f32>()) {
         // SAFETY: nothing is read.
         unsafe { _mm_prefetch::<_MM_HINT_T1>(line.as_ptr().cast()) }
     }
