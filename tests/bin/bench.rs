@@ -1,7 +1,7 @@
 //! `bench [--quick] [--gpu] [--width 64|256] [--json] [--write]`: what a pose step, a training step and a picture cost on every executor, beside
 //! the rate that the matrix library reaches in the same run, and beside PyTorch where `python3` (or the interpreter that `PYTHON` names) has it.
 //! All that is compared takes turns, so that a busy minute of the machine meets all alike. `--gpu`: only there, ours and PyTorch's; `--width`: only
-//! the nets of that width. `--write` puts the tables into `docs/performance.md`.
+//! the nets of that width. `--write` puts the tables into `docs/performance.md`, all of them.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -142,6 +142,9 @@ fn run() -> Result<()> {
             },
             other => return Err(format!("{USAGE}, not {other}").into()),
         }
+    }
+    if has("--write") && (quick || only_gpu || widths.len() < 2) {
+        return Err("--write replaces the whole table of docs/performance.md: it goes with none of --quick, --gpu and --width".into());
     }
 
     let mut engines = if only_gpu { vec![] } else { vec![Engine::cpu()] };

@@ -137,9 +137,9 @@ impl Chooser {
         if let Some(&variant) = chosen.get(&shape) {
             return Ok(variant);
         }
-        // The plain form is for nothing but to be compared with. What is one dispatch less on a device is nothing to the threads of a processor.
+        // The plain form is for nothing but to be compared with.
         let usable = usable(gpu, step);
-        let fast = usable.get(1).copied().filter(|_| gpu.can_time() && !gpu.adapter().is_software);
+        let fast = usable.get(1).copied().filter(|_| gpu.may_join());
         let variant = match (&self.choice, fast) {
             (Choice::Named(name), _) => usable.last().copied().filter(|_| name == step.kernel.op),
             (Choice::Measured { .. }, None) => None,

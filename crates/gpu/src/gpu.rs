@@ -146,8 +146,13 @@ impl Gpu {
             requires => self.has_subgroups() || !requires.contains(&Requirement::Subgroups),
         };
         let others = TABLE.iter().flat_map(|kernel| kernel.variants.iter().skip(1)).filter(may_run);
-        let joined = (!self.adapter().is_software).then_some(HIDDEN_LAYER_FORWARD.op);
+        let joined = self.may_join().then_some(HIDDEN_LAYER_FORWARD.op);
         others.filter_map(|variant| variant.name.rsplit('_').next()).chain(joined).collect()
+    }
+
+    /// Whether two steps may be one where that is faster: it must be timed, and one dispatch less is nothing to the threads of a processor.
+    pub(crate) fn may_join(&self) -> bool {
+        self.can_time() && !self.adapter().is_software
     }
 
     pub(crate) fn chooser(&self) -> &Chooser {
