@@ -144,7 +144,9 @@ fn run() -> Result<()> {
         }
     }
     if has("--write") && (quick || only_gpu || widths.len() < 2) {
-        return Err("--write replaces the whole table of docs/performance.md: it goes with none of --quick, --gpu and --width".into());
+        return Err(
+            "--write replaces the whole table of docs/performance.md: it goes with none of --quick, --gpu and --width".into()
+        );
     }
 
     let mut engines = if only_gpu { vec![] } else { vec![Engine::cpu()] };
