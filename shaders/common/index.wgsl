@@ -9,3 +9,9 @@ fn flat_index(workgroup: vec3<u32>, workgroups: vec3<u32>, local: vec3<u32>) -> 
 fn tile_index(workgroup: vec3<u32>, local: vec3<u32>, extent: vec2<u32>) -> vec2<u32> {
     return 8u * workgroup.xy + select(local.xy, local.yx, extent.y > extent.x);
 }
+
+// Where one of 64 invocations stands among eight by eight. Of four neighbours two have the same x, and two the same y: NVIDIA's GPUs load the vectors of
+// such pairs together.
+fn among_eight(index: u32) -> vec2<u32> {
+    return vec2((index & 1u) | ((index >> 1u) & 6u), ((index >> 1u) & 1u) | ((index >> 3u) & 6u));
+}

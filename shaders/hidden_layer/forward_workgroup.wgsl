@@ -85,19 +85,13 @@ fn put(group: u32, row: u32, out: u32, from_mean: vec4<f32>, mean: f32, rstd: f3
     y[at] = max(affine[out / 4u] * (from_mean * rstd) + affine[n + out / 4u], vec4(0.0));
 }
 
-// Where an invocation stands among eight columns by eight rows of lanes. Of four neighbours two load the same vectors of rows, and two the same of
-// features: NVIDIA's GPUs load such pairs together.
-fn place(index: u32) -> vec2<u32> {
-    return vec2((index & 1u) | ((index >> 1u) & 6u), ((index >> 1u) & 1u) | ((index >> 3u) & 6u));
-}
-
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) index: u32,
 ) {
-    let local = place(index);
+    let local = among_eight(index);
     let first_row = 32u * (workgroup.y * workgroups.x + workgroup.x);
     let group = workgroup.z;
     // What this invocation copies: four rows of W and, where it is one of the last 32, of x, four features of each; the last row stands in for those

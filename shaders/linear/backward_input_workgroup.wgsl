@@ -89,19 +89,13 @@ fn store(part: u32, row: u32, in_: u32, tile: mat4x4<f32>) {
     put(part, row + 3u, in_, tile[3]);
 }
 
-// Where an invocation stands among eight by eight. Of four neighbours two load the same vectors of rows, and two the same of features: NVIDIA's GPUs
-// load such pairs together.
-fn place(index: u32) -> vec2<u32> {
-    return vec2((index & 1u) | ((index >> 1u) & 6u), ((index >> 1u) & 1u) | ((index >> 3u) & 6u));
-}
-
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) index: u32,
 ) {
-    let local = place(index);
+    let local = among_eight(index);
     // One after the other those that read the same rows.
     let number = workgroup.y * workgroups.x + workgroup.x;
     let first_row = 64u * (number / workgroups.y);
