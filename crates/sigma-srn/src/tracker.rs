@@ -1,5 +1,7 @@
 //! An object's pose from frame to frame: the next one is near the last.
 
+use std::iter;
+
 use glam::DMat4;
 
 use crate::confidence::Doubt;
@@ -45,53 +47,94 @@ impl Tracker {
         Ok(Tracker { engine: engine.clone(), model, instance, number, search, before: rough.into_iter().collect(), rim: None })
     }
 
+    /// The pose in the next frame, if the object goes on as it did; `None` as long as it is lost.
+    pub fn expected(&self) -> Option<DMat4> {
+        match self.before[..] {
+            [] => None,
+            [last] => Some(last),
+            [last, earlier, ..] => Some(last * earlier.inverse() * last),
+        }
+    }
+
     /// Finds the pose in the next frame. [`Query::starts`] are where to search if it does not lie near the last pose, all around the object say.
     /// [`Query::outline`] is not looked at: who cuts frames out does it alike from one to the next, so how wrong masks are is found out once.
     pub fn next(&mut self, frame: Query, mut observe: impl FnMut(Progress) -> Result<(), Error>) -> Result<Tracked, Error> {
+        let frame = self.prepared(frame)?;
+        let followed = self.followed(&frame, &mut observe)?;
+        // An object that comes too near or goes too far away is followed all the same.
+        let followed = followed.filter(|found| matches!(found.doubt, None | Some(Doubt::Distance | Doubt::Small)));
+        let is_searched = followed.is_none();
+        let found = match followed {
+            Some(found) => found,
+            None => self.search.run(&self.engine, &self.model, std::slice::from_ref(&frame), &mut observe)?.remove(0),
+        };
+        // Else what is not to be trusted is no place to go on from.
+        if is_searched {
+            self.before.clear();
+        }
+        if found.is_trusted() || !is_searched {
+            self.keep(&found, &frame, is_searched);
+        }
+        Ok(Tracked { found, is_searched })
+    }
+
+    /// The same from the last pose alone, however much is unexplained: for a caller who searches all around himself. `None` where the object is lost.
+    pub fn follow(&mut self, frame: Query, observe: impl FnMut(Progress) -> Result<(), Error>) -> Result<Option<Found>, Error> {
+        let frame = self.prepared(frame)?;
+        let found = self.followed(&frame, observe)?;
+        found.iter().for_each(|found| self.keep(found, &frame, false));
+        Ok(found)
+    }
+
+    /// Finds the pose in the last frame once more, from where it was found: cut out in a better way, say.
+    pub fn again(&mut self, frame: Query, observe: impl FnMut(Progress) -> Result<(), Error>) -> Result<Option<Found>, Error> {
+        let earlier = self.before.split_off(self.before.len().min(1));
+        let found = self.follow(frame, observe)?;
+        self.before.truncate(1);
+        self.before.extend(earlier);
+        Ok(found)
+    }
+
+    /// The object is known to have had this pose in the last frame.
+    pub fn restart(&mut self, world_from_camera: DMat4) {
+        self.before = vec![world_from_camera];
+    }
+
+    /// For this object, with what is known of masks.
+    fn prepared(&self, frame: Query) -> Result<Query, Error> {
         if frame.instance != self.instance {
             let what = format!("shows instance {}, but {} is followed", frame.instance, self.instance);
             return Err(Error::Input { input: "frame".into(), what });
         }
-        let (engine, model) = (&self.engine, &self.model);
-        let focal = frame.intrinsics.fx;
-        let rim = self.rim.unwrap_or_default() * focal;
+        let rim = self.rim.unwrap_or_default() * frame.intrinsics.fx;
         let outline = Outline {
             dilation: rim.dilation.clamp(-WIDEST_RIM, WIDEST_RIM),
             cut: rim.cut.clamp_length_max(WIDEST_CUT),
             missing: rim.missing.clamp_length_max(MISSING),
             undecided: rim.undecided.min(WIDEST_CUT),
         };
-        let frame = Query { instance: self.number, outline, ..frame };
-        let near = match self.before[..] {
-            [] => None,
-            [last] => Some(vec![last]),
+        Ok(Query { instance: self.number, outline, ..frame })
+    }
+
+    /// What the last poses lead to.
+    fn followed(&self, frame: &Query, observe: impl FnMut(Progress) -> Result<(), Error>) -> Result<Option<Found>, Error> {
+        let starts: Vec<_> = match self.before[..] {
+            [] => return Ok(None),
+            [last] => vec![last],
             // It stands still, or goes on as it did.
-            [last, earlier, ..] => Some(vec![last, last * earlier.inverse() * last]),
+            [last, ..] => iter::once(last).chain(self.expected()).collect(),
         };
-        let followed = match near {
-            Some(starts) => {
-                let frame = Query { starts, ..frame.clone() };
-                Some(self.near()?.run(engine, model, &[frame], &mut observe)?.remove(0))
-            }
-            None => None,
-        };
-        // An object that comes too near or goes too far away is followed all the same.
-        let followed = followed.filter(|found| matches!(found.doubt, None | Some(Doubt::Distance | Doubt::Small)));
-        let is_searched = followed.is_none();
-        let found = match followed {
-            Some(found) => found,
-            None => self.search.run(engine, model, &[frame], &mut observe)?.remove(0),
-        };
+        let frame = Query { starts, ..frame.clone() };
+        Ok(Some(self.near()?.run(&self.engine, &self.model, &[frame], observe)?.remove(0)))
+    }
+
+    fn keep(&mut self, found: &Found, frame: &Query, is_searched: bool) {
         // Else it was not tried.
         if found.is_trusted() && (is_searched || self.rim.is_none()) {
-            self.rim = found.estimate.outline.map(|by| by * (1.0 / focal)).or(self.rim);
+            self.rim = found.estimate.outline.map(|by| by * (1.0 / frame.intrinsics.fx)).or(self.rim);
         }
-        self.before.truncate(if is_searched { 0 } else { 1 });
-        // Else what is not to be trusted is no place to go on from.
-        if found.is_trusted() || !is_searched {
-            self.before.insert(0, found.world_from_camera);
-        }
-        Ok(Tracked { found, is_searched })
+        self.before.truncate(1);
+        self.before.insert(0, found.world_from_camera);
     }
 
     /// How the outlines of the frames' masks are moved, as far as that was tried, in pixels over the focal length.

@@ -5,7 +5,7 @@ use std::rc::Rc;
 use glam::DMat4;
 use sigma_srn::camera::{fixed24, neighbor4};
 use sigma_srn::{Found, Intrinsics};
-use srn_data::segment::Known;
+use srn_data::segment::{BoundingBox, Known};
 
 use super::files::Picture;
 use super::outline::FoundObject;
@@ -17,6 +17,16 @@ use crate::common::Result;
 const SIDE: u32 = 32;
 /// Where all channels are at least this (of [-1, 1]) a view shows background, or its edge.
 const WHITE: f32 = 0.9;
+
+/// The value of --box.
+pub fn bounding_box(text: &str) -> std::result::Result<BoundingBox, String> {
+    let numbers: Vec<f64> =
+        text.split(',').filter_map(|number| number.trim().parse().ok()).filter(|n: &f64| n.is_finite()).collect();
+    match (&numbers[..], text.matches(',').count()) {
+        (&[x, y, width, height], 3) if width > 0.0 && height > 0.0 => Ok(BoundingBox { corner: [x, y], size: [width, height] }),
+        _ => Err("expected left edge, top edge, width and height in pixels: `120,80,200,160`".into()),
+    }
+}
 
 /// What came of a search.
 pub struct Outcome {
@@ -72,7 +82,7 @@ impl Boxed<'_> {
         let first = pass(pictures.clone(), &starts.collect::<Result<Vec<_>>>()?)?;
         let mut anew = Vec::new();
         for (&number, Outcome { picture, found, .. }) in numbers.iter().zip(&first) {
-            let object = FoundObject::of(picture, found, self.on, 1)?;
+            let object = FoundObject::of(picture, &found.world_from_camera, self.on, 1)?;
             let cut = (self.open)(number, Known { colours: &[], place: Some(&|at| object.covers(at)) });
             // Or nothing, where the pose is far off.
             anew.push(cut.unwrap_or_else(|_| picture.clone()));

@@ -13,7 +13,7 @@ use srn_data::camera::Axes;
 use srn_data::segment::{BoundingBox, Known};
 use srn_data::target::Cutout;
 
-use super::boxed::{Boxed, Outcome};
+use super::boxed::{Boxed, Outcome, bounding_box};
 use super::files::{Masks, ObjectArgs, Picture, PoseSource, model_side, srn_instance, warn_of_turned};
 use super::mask::MadeRight;
 use super::notation::{Notation, NotationArgs, ObjectPose};
@@ -340,16 +340,6 @@ fn opened(args: &Estimate, model: &Model, side: u32, number: usize, known: Known
     let any = args.unseen.then(|| model.instance_name(0));
     let instance = any.as_deref().or(args.object.instance.as_deref());
     Picture::open(&args.images[number], masks, model, side, instance, &args.object.camera)
-}
-
-/// The value of --box.
-fn bounding_box(text: &str) -> std::result::Result<BoundingBox, String> {
-    let numbers: Vec<f64> =
-        text.split(',').filter_map(|number| number.trim().parse().ok()).filter(|n: &f64| n.is_finite()).collect();
-    match (&numbers[..], text.matches(',').count()) {
-        (&[x, y, width, height], 3) if width > 0.0 && height > 0.0 => Ok(BoundingBox { corner: [x, y], size: [width, height] }),
-        _ => Err("expected left edge, top edge, width and height in pixels: `120,80,200,160`".into()),
-    }
 }
 
 /// What was found so far.

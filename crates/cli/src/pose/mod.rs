@@ -7,6 +7,7 @@ mod draw;
 pub mod estimate;
 pub mod evaluate;
 mod files;
+mod follow;
 mod heldout;
 mod mask;
 mod notation;

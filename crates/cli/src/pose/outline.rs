@@ -2,9 +2,11 @@
 
 use std::path::Path;
 
+use glam::DMat4;
 use image::{Rgb, RgbImage};
 use sigma_srn::{Found, Intrinsics};
 use srn_data::pixels::Pixels;
+use srn_data::segment::BoundingBox;
 use srn_data::sheet::{self, BLACK, Colour};
 
 use super::files::Picture;
@@ -22,7 +24,7 @@ const LEAST_HEIGHT: u32 = 320;
 
 /// Writes `NAME-outline.png` of the picture at `path` to `dir`.
 pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, on: On) -> Result<()> {
-    let object = FoundObject::of(picture, found, on, FINEST)?;
+    let object = FoundObject::of(picture, &found.world_from_camera, on, FINEST)?;
     let photo = Pixels::open(path)?.to_rgb8();
     let factor = LEAST_HEIGHT.div_ceil(photo.height());
     let mut page = sheet::enlarge(&photo, factor);
@@ -38,7 +40,7 @@ pub struct FoundObject {
 
 impl FoundObject {
     /// By a view at most so many times as fine as the model's own.
-    pub fn of(picture: &Picture, found: &Found, on: On, finest: usize) -> Result<Self> {
+    pub fn of(picture: &Picture, world_from_camera: &DMat4, on: On, finest: usize) -> Result<Self> {
         let side = on.side;
         let times = picture.square.1.div_ceil(side as usize).clamp(1, finest) as u32;
         let (k, before) = (f64::from(times), 0.5 * (WIDER - 1) as f64 * f64::from(side));
@@ -47,8 +49,29 @@ impl FoundObject {
         let [cx, cy] = [cx, cy].map(|c| k * (c + before + 0.5) - 0.5);
         let view_side = WIDER as u32 * times * side;
         let camera = Intrinsics { fx: k * fx, fy: k * fy, cx, cy, pixel_center };
-        let view = &render(On { side: view_side, ..on }, &[(picture.instance, found.world_from_camera, camera)])?[0];
+        let view = &render(On { side: view_side, ..on }, &[(picture.instance, *world_from_camera, camera)])?[0];
         Ok(FoundObject { silhouette: Silhouette::of(&view.rgb, view_side as usize), square: picture.square })
+    }
+
+    /// A box around it, in pixels; `None` where the view shows nothing.
+    pub fn bounds(&self) -> Option<BoundingBox> {
+        let (corner, extent) = self.square;
+        let [first, last] = self.silhouette.bounds()?;
+        let in_picture = |k: usize, at: f64| corner[k] as f64 + extent as f64 * (WIDER as f64 * (at - 0.5) + 0.5);
+        let size = [0, 1].map(|k| (WIDER * extent) as f64 * (last[k] - first[k]));
+        Some(BoundingBox { corner: [0, 1].map(|k| in_picture(k, first[k])), size })
+    }
+
+    /// The part of what it covers, or another does, that both cover; 0 where that is nothing.
+    pub fn overlap(&self, other: &Self) -> f64 {
+        const CELLS: usize = 64;
+        let Some([a, b]) = self.bounds().zip(other.bounds()).map(<[_; 2]>::from) else { return 0.0 };
+        let first = [0, 1].map(|k| a.corner[k].min(b.corner[k]));
+        let end = [0, 1].map(|k| (a.corner[k] + a.size[k]).max(b.corner[k] + b.size[k]));
+        let place = |cell: [usize; 2]| [0, 1].map(|k| first[k] + (cell[k] as f64 + 0.5) / CELLS as f64 * (end[k] - first[k]));
+        let cells = (0..CELLS * CELLS).map(|i| place([i % CELLS, i / CELLS])).map(|at| (self.covers(at), other.covers(at)));
+        let (both, any) = cells.fold((0, 0), |(both, any), (a, b)| (both + usize::from(a && b), any + usize::from(a || b)));
+        f64::from(both as u32) / f64::from(any.max(1) as u32)
     }
 
     /// Whether it covers a place, in pixels; their edges are whole numbers.
@@ -96,6 +119,18 @@ impl Silhouette {
         let enclosed = self.darkness.iter_mut().zip(reached).filter(|(darkness, reached)| !reached && **darkness <= limit);
         enclosed.for_each(|(darkness, _)| *darkness = 2.0 * limit);
         self
+    }
+
+    /// First and last place that the object covers, 0 to 1 across and down.
+    fn bounds(&self) -> Option<[[f64; 2]; 2]> {
+        let covered = self.darkness.iter().enumerate().filter(|(_, darkness)| **darkness > self.limit);
+        let cells = covered.map(|(i, _)| [i % self.side, i / self.side]);
+        let around = |bounds: Option<[[usize; 2]; 2]>, cell: [usize; 2]| {
+            let [low, high] = bounds.unwrap_or([cell; 2]);
+            Some([[0, 1].map(|k| low[k].min(cell[k])), [0, 1].map(|k| high[k].max(cell[k] + 1))])
+        };
+        let ends = cells.fold(None, around)?;
+        Some(ends.map(|end| end.map(|cells| cells as f64 / self.side as f64)))
     }
 
     /// Whether the object covers a place of the view, 0 to 1 across and down; smooth between pixels.

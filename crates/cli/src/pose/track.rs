@@ -9,13 +9,16 @@ use indicatif::ProgressBar;
 use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Tracked, Tracker};
 use srn_data::pixels::{ENDINGS, is_picture};
+use srn_data::segment::{BoundingBox, Known};
 use srn_data::target::Cutout;
 
+use super::boxed::bounding_box;
 use super::draw;
 use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side, warn_of_turned};
+use super::follow::{Follower, Looking};
 use super::mask::MadeRight;
 use super::notation::{NotationArgs, ObjectPose};
-use super::search::{PoseError, SearchArgs, deviation, query, with_cooperative_said};
+use super::search::{On, PoseError, SearchArgs, Starts, deviation, query, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, lossy, print, refuse_to_write};
 use crate::progress;
 
@@ -40,6 +43,10 @@ pub struct Track {
     /// Folder with masks called like the frames, of what is the object; see `estimate`.
     #[arg(long, value_name = "DIR")]
     cutout: Option<PathBuf>,
+    /// A box around the object in the first frame, as a detector gives it; see `estimate`. Frames need not be cut out then: what in each of them is the object is found
+    /// by its colours, and by where the poses before lead one to expect it.
+    #[arg(long = "box", value_name = "X,Y,W,H", value_parser = bounding_box, allow_hyphen_values = true, conflicts_with = "cutout")]
+    bounds: Option<BoundingBox>,
     /// Folder with masks called like the frames, of what counts; see `estimate`.
     #[arg(long, value_name = "DIR")]
     mask: Option<PathBuf>,
@@ -88,6 +95,7 @@ struct FrameReport<'a> {
     #[serde(flatten)]
     mask: MadeRight,
     error: Option<PoseError>,
+    /// From the picture on disk to its pose.
     seconds: f64,
 }
 
@@ -111,13 +119,24 @@ pub fn run(args: &Track) -> Result<bool> {
     let first = frames.next().ok_or("stdin: no frame's path on it")??;
     let side = model_side(&model, &first)?;
     warn_of_turned(&first);
+    let on = On { engine: &engine, model: &model, side };
+    let open = |path: &Path, cutout: Option<Cutout>| {
+        let masks = Masks { cutout, mask: args.mask.as_deref() };
+        Picture::open(path, masks, &model, side, args.object.instance.as_deref(), &args.object.camera)
+    };
+    let search = args.search.single(args.search.options()?);
     let mut animation = None;
-    let (mut tracker, mut followed) = (None, None);
+    let (mut tracker, mut followed) = (None::<Tracker>, None);
+    let mut follower = args.bounds.map(Follower::new);
     let (mut errors, mut searches, mut trusted, mut count) = (Vec::new(), 0, true, 0);
     for path in std::iter::once(Ok(first)).chain(frames) {
         let path = path?;
-        let masks = Masks { cutout: args.cutout.as_deref().map(Cutout::Mask), mask: args.mask.as_deref() };
-        let picture = Picture::open(&path, masks, &model, side, args.object.instance.as_deref(), &args.object.camera);
+        let (began, mut bar) = (Instant::now(), None::<ProgressBar>);
+        let boxed = |bounds: BoundingBox, known: Known| open(&path, Some(Cutout::Box(bounds, known)));
+        let picture = match &mut follower {
+            Some(follower) => follower.open(&boxed),
+            None => open(&path, args.cutout.as_deref().map(Cutout::Mask)),
+        };
         let name = |number| model.instance_name(number);
         let picture = picture.and_then(|picture| match followed {
             Some(followed) if picture.instance != followed => {
@@ -149,19 +168,21 @@ pub fn run(args: &Track) -> Result<bool> {
             truth => truth?,
         };
         followed = Some(picture.instance);
-        let starts = args.search.starts(&args.search.all_around(), &model, &picture, side, None, &notation)?;
+        let rough = args.rough.as_ref().filter(|_| tracker.is_none()).map(|rough| rough.read(&path, &notation)).transpose()?;
+        let is_boxed = follower.is_some();
+        let starts = |picture: &Picture| {
+            let (starts, rough) = match &rough {
+                Some(rough) if is_boxed => (Starts::Neighbor4, Some(rough)),
+                _ => (args.search.all_around(), None),
+            };
+            args.search.starts(&starts, &model, picture, side, rough, &notation)
+        };
         let tracker = match &mut tracker {
             Some(tracker) => tracker,
-            none => {
-                let rough = args.rough.as_ref().map(|rough| rough.read(&path, &notation)).transpose()?;
-                let search = args.search.single(args.search.options()?);
-                none.insert(Tracker::new(&engine, &model, picture.instance, search, rough)?)
-            }
+            none => none.insert(Tracker::new(&engine, &model, picture.instance, search.clone(), rough)?),
         };
         count += 1;
-        let frame = query(&picture, side, &starts);
-        let (began, mut bar) = (Instant::now(), None::<ProgressBar>);
-        let observe = |seen: Progress| {
+        let mut observe = |seen: Progress| {
             // Most frames are done before anyone wonders.
             if began.elapsed() > PATIENCE {
                 let bar = bar.get_or_insert_with(|| progress::bar(0, "steps"));
@@ -170,9 +191,18 @@ pub fn run(args: &Track) -> Result<bool> {
             }
             Ok(())
         };
-        let tracked = with_cooperative_said(&engine, || Ok(tracker.next(frame, observe)?));
+        let tracked = with_cooperative_said(&engine, || match &mut follower {
+            Some(follower) => {
+                let looking = Looking { on, search: &search, starts: &starts, open: &boxed };
+                follower.next(picture, tracker, &looking, &mut observe)
+            }
+            None => {
+                let tracked = tracker.next(query(&picture, side, &starts(&picture)?), &mut observe)?;
+                Ok((picture, tracked))
+            }
+        });
         bar.iter().for_each(ProgressBar::finish_and_clear);
-        let Tracked { found, is_searched: searched } = tracked?;
+        let (picture, Tracked { found, is_searched: searched }) = tracked?;
         trusted = found.is_trusted();
         let mask = MadeRight::of(&found.estimate, picture.pixels_on_disk(side));
         let error = truth.map(|truth| notation.error(PoseError::of(&found.world_from_camera, &truth)));
@@ -198,7 +228,7 @@ pub fn run(args: &Track) -> Result<bool> {
             searched,
             mask,
             error,
-            seconds: found.seconds,
+            seconds: began.elapsed().as_secs_f64(),
         };
         print(&if args.json { serde_json::to_string(&report)? } else { report.line(&Pose6::from_matrix(&written)) })?;
     }
