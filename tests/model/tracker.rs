@@ -54,6 +54,24 @@ fn an_object_is_followed_and_found_again() {
         assert_eq!((next.is_searched, next.found.doubt), (true, Some(Doubt::Unexplained)));
     }
 
+    // Who searches himself follows all the same, from what he says, and may look at a frame twice.
+    assert!(
+        tracker.expected().is_none() && tracker.follow(frame(&cameras()[0], intrinsics, false), |_| Ok(())).unwrap().is_none()
+    );
+    tracker.restart(cameras()[0]);
+    assert_eq!(tracker.expected(), Some(cameras()[0]));
+    for (k, camera) in cameras().iter().enumerate().take(4).skip(1) {
+        let found = tracker.follow(frame(camera, intrinsics, false), |_| Ok(())).unwrap().unwrap();
+        let again = tracker.again(frame(camera, intrinsics, false), |_| Ok(())).unwrap().unwrap();
+        for (found, most) in [(found, 2.0), (again, 1.0)] {
+            let off = camera::pose_error(&found.world_from_camera, camera).0;
+            assert!(off < most && found.doubt == Some(Doubt::Unexplained), "frame {k}: {off}°");
+        }
+        // It goes on from the frame before, however often that was looked at.
+        let off = camera::pose_error(&tracker.expected().unwrap(), &cameras()[k + 1]).0;
+        assert!(k == 3 || off < 2.0, "after frame {k}: {off}°");
+    }
+
     // How far off masks are is found out in the first frame and known in those that follow, also through a lens that shows more pixels of it.
     let mut tracker = new(search, Some(cameras()[0]));
     let mut next = |k: usize, intrinsics: Intrinsics| {

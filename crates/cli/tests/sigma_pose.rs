@@ -850,33 +850,77 @@ fn a_camera_may_be_rolled() {
     }
 }
 
-/// Not cut out: an object before another one on a chequered table, a box around it.
-#[test]
-fn a_box_around_the_object_is_enough() {
-    let home = TempDir::new().unwrap();
-    let dir = home.path();
-    let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/models/compact.safetensors");
+/// A seat before a forklift on a chequered table, the seat's view at this place of the photograph; the box around the seat.
+fn on_a_table(front: [u32; 2], path: &Path) -> String {
     let view = |object: &str| image::open(format!("{TEST}/{object}/rgb/000006.png")).unwrap().into_rgb8();
     let (seat, forklift) = (view("seat"), view("forklift"));
-    // Where the pictures lie in the photograph.
-    let (front, behind) = ([50, 30], [80, 45]);
     let of = |picture: &image::RgbImage, [dx, dy]: [u32; 2], x: u32, y: u32| {
         let pixel = picture.get_pixel_checked(x.checked_sub(dx)?, y.checked_sub(dy)?)?;
         (pixel.0 != [255; 3]).then_some(*pixel)
     };
     let table = |x: u32, y: u32| image::Rgb(if (x / 9 + y / 9).is_multiple_of(2) { [120, 92, 70] } else { [150, 120, 96] });
-    let pixel = |x, y| of(&seat, front, x, y).or_else(|| of(&forklift, behind, x, y)).unwrap_or_else(|| table(x, y));
-    image::RgbImage::from_fn(160, 128, pixel).save(dir.join("photo.png")).unwrap();
-    fs::write(dir.join("camera.txt"), "74.4 82 62 0.\n0. 0. 0.\n1.\n128 160\n").unwrap();
+    let pixel = |x, y| of(&seat, front, x, y).or_else(|| of(&forklift, [80, 45], x, y)).unwrap_or_else(|| table(x, y));
+    image::RgbImage::from_fn(160, 128, pixel).save(path).unwrap();
     let places = || (0..128).flat_map(|y| (0..160).map(move |x| (x, y))).filter(|&(x, y)| of(&seat, front, x, y).is_some());
     let [columns, rows]: [Vec<u32>; 2] = [places().map(|(x, _)| x).collect(), places().map(|(_, y)| y).collect()];
     let [(left, right), (top, bottom)] = [columns, rows].map(|at| (*at.iter().min().unwrap(), at.iter().max().unwrap() + 1));
-    let given = format!("--box {left},{top},{},{} --intrinsics camera.txt", right - left, bottom - top);
-    let args = format!("--model {model} --instance seat --truth DATA/seat/pose/000006.txt --executor cpu --effort fast --json");
+    format!("{left},{top},{},{}", right - left, bottom - top)
+}
+
+const SHIPPED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/models/compact.safetensors");
+
+/// Not cut out, a box around the object.
+#[test]
+fn a_box_around_the_object_is_enough() {
+    let home = TempDir::new().unwrap();
+    let dir = home.path();
+    let bounds = on_a_table([50, 30], &dir.join("photo.png"));
+    fs::write(dir.join("camera.txt"), "74.4 82 62 0.\n0. 0. 0.\n1.\n128 160\n").unwrap();
+    let given = format!("--box {bounds} --intrinsics camera.txt");
+    let args = format!("--model {SHIPPED} --instance seat --truth DATA/seat/pose/000006.txt --executor cpu --effort fast --json");
     let found = json(&run(dir, &format!("estimate photo.png {given} {args} --record out"), 0))["images"][0].take();
     let off = found["error"]["rotation_deg"].as_f64().unwrap();
     assert!(off < 1.5 && found["trusted"] == true && found["within_95"] == true, "{found}");
     assert_eq!(files(&dir.join("out")), ["seat-photo-outline.png", "seat-photo.gif", "seat-photo.png"]);
+}
+
+/// The seat goes to the right, and once something is before the whole camera.
+#[test]
+fn a_box_in_the_first_frame_is_enough() {
+    let home = TempDir::new().unwrap();
+    let dir = home.path();
+    fs::write(dir.join("camera.txt"), "74.4 82 62 0.\n0. 0. 0.\n1.\n128 160\n").unwrap();
+    fs::create_dir(dir.join("frames")).unwrap();
+    let mut boxes = vec![];
+    for k in 0..5 {
+        boxes.push(on_a_table([50 + 3 * k, 30], &dir.join(format!("frames/{k}.png"))));
+    }
+    image::RgbImage::from_pixel(160, 128, image::Rgb([9; 3])).save(dir.join("frames/2.png")).unwrap();
+    let args = format!("--intrinsics camera.txt --model {SHIPPED} --instance seat --executor cpu --effort fast --json");
+    let track = format!("track frames --box {} {args}", boxes[0]);
+    let lines = |printed: &str| -> Vec<Value> { printed.lines().map(|line| serde_json::from_str(line).unwrap()).collect() };
+    let each = |lines: &[Value], of: &str| lines.iter().map(|line| line[of].as_bool()).collect::<Vec<_>>();
+    let frames = lines(&run(dir, &format!("{track} --record track.gif"), 0));
+    assert_eq!(each(&frames, "trusted"), [true, true, false, true, true].map(Some));
+    assert_eq!(each(&frames, "searched"), [Some(true), Some(false), None, Some(false), Some(false)]);
+    assert!(frames[2]["failure"].as_str().unwrap().contains("box"), "{}", frames[2]);
+    assert_eq!(frames_of(&dir.join("track.gif")), 4);
+    // Where a search with a box finds it in the last of them, too.
+    let alone = json(&run(dir, &format!("estimate frames/4.png --box {} {args}", boxes[4]), 0))["images"][0].take();
+    let position = |found: &Value| {
+        let place = |k: usize| found["world_from_camera"][k][3].as_f64().unwrap();
+        [place(0), place(1), place(2)]
+    };
+    let apart: f64 = position(&alone).iter().zip(position(&frames[4])).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+    assert!(apart < 0.04, "{apart}");
+
+    // What is not to be trusted is followed all the same, and searched for all around in the first of ten; with a rough pose 30° from that.
+    fs::copy(format!("{TEST}/seat/pose/000006.txt"), dir.join("rough.txt")).unwrap();
+    let doubted = lines(&run(dir, &format!("{track} --rough rough.txt --accept 1e-9"), 1));
+    assert_eq!(each(&doubted, "searched"), [Some(true), Some(false), None, Some(false), Some(false)]);
+    assert!(doubted[4]["trusted"] == false && doubted[4]["doubt"] == "unexplained", "{}", doubted[4]);
+    fail(dir, &format!("{track} --cutout masks"), &["--box", "--cutout"]);
+    fail(dir, &format!("track frames --box 500,9,9,9 {args}"), &["0.png", "box 500,9,9,9"]);
 }
 
 /// Pictures cut out with a rim of the table around the object, or with too little of it.
@@ -884,7 +928,7 @@ fn a_box_around_the_object_is_enough() {
 fn a_mask_need_not_be_exact() {
     let home = TempDir::new().unwrap();
     let dir = home.path();
-    let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/models/compact.safetensors");
+    let model = SHIPPED;
     let picture = image::open(format!("{TEST}/valve/rgb/000005.png")).unwrap().into_rgb8();
     let is_object = |x: i64, y: i64| {
         let is_inside = (0..64).contains(&x) && (0..64).contains(&y);

@@ -16,8 +16,8 @@ pub struct BoundingBox {
     pub size: [f64; 2],
 }
 
-/// Whether a place of the picture, across and down in pixels, is thought to show the object.
-pub type Guess<'a> = &'a dyn Fn([f64; 2]) -> bool;
+/// Whether a place of the picture, across and down in pixels, is thought to show the object; `None`: that is not known.
+pub type Guess<'a> = &'a dyn Fn([f64; 2]) -> Option<bool>;
 
 /// Room around the box from which the surroundings are learnt, as a share of its longer side.
 const SURROUNDINGS: f64 = 0.3;
@@ -56,15 +56,18 @@ pub(crate) fn object_in(picture: &Pixels, bounds: BoundingBox, known: Known) -> 
     let longer = bounds.size[0].max(bounds.size[1]);
     let slack = longer * if known.place.is_some() { SLACK_OF_GUESS } else { SLACK };
     let may_be = grid.each(|at| bounds.is_within(at, slack));
-    let prior = known.place.map_or(vec![0.0; may_be.len()], |place| grid.prior(&grid.each(place), DOUBT * longer));
-    let mut object = match known.place {
-        Some(place) => grid.each(|at| place(at) && bounds.is_within(at, slack)),
-        None => grid.each(|at| bounds.is_within(at, 0.0)),
+    let guess = match known.place {
+        Some(place) => grid.each(|at| if bounds.is_within(at, slack) { place(at) } else { Some(false) }),
+        None => grid.each(|at| Some(bounds.is_within(at, 0.0))),
     };
+    let prior = if known.place.is_some() { grid.prior(&guess, DOUBT * longer) } else { vec![0.0; guess.len()] };
+    let mut object: Vec<bool> = guess.iter().map(|guess| *guess == Some(true)).collect();
     let palette: Vec<DVec3> = known.colours.iter().map(|colour| DVec3::from(colour.map(f64::from))).collect();
     let edges = grid.edges();
     for round in 0..ROUNDS {
-        let side = |of: bool| grid.colours.iter().zip(&object).filter(move |(_, is_in)| **is_in == of).map(|(colour, _)| *colour);
+        // What nobody knows yet says nothing of either.
+        let is_on = |i: usize, of: bool| if round == 0 { guess[i] == Some(of) } else { object[i] == of };
+        let side = |of: bool| grid.colours.iter().enumerate().filter(move |(i, _)| is_on(*i, of)).map(|(_, colour)| *colour);
         let mut own = side(true).collect::<Vec<_>>();
         // At first the box has other things in it, too.
         let is_first = round == 0 && known.place.is_none() && !palette.is_empty();
@@ -132,7 +135,7 @@ impl Grid {
     }
 
     /// Something of the middle of each cell, in pixels of the picture.
-    fn each(&self, of: impl Fn([f64; 2]) -> bool) -> Vec<bool> {
+    fn each<T>(&self, of: impl Fn([f64; 2]) -> T) -> Vec<T> {
         let place = |i: usize| {
             let cell = [i % self.size[0], i / self.size[0]];
             [0, 1].map(|k| self.corner[k] + (cell[k] as f64 + 0.5) * self.pitch[k])
@@ -141,9 +144,9 @@ impl Grid {
     }
 
     /// Logarithm of the odds that a cell is the object, by a guess whose edge is off by some `pixels`.
-    fn prior(&self, guess: &[bool], pixels: f64) -> Vec<f64> {
+    fn prior(&self, guess: &[Option<bool>], pixels: f64) -> Vec<f64> {
         let [width, height] = self.size.map(|cells| cells as u32);
-        let guess = guess.iter().map(|&is_object| f32::from(u8::from(is_object))).collect();
+        let guess = guess.iter().map(|guess| guess.map_or(0.5, |is_object| f32::from(u8::from(is_object)))).collect();
         let guess: ImageBuffer<Luma<f32>, Vec<f32>> = ImageBuffer::from_vec(width, height, guess).unwrap_or_default();
         let smooth = imageops::blur(&guess, (pixels / self.pitch[0]) as f32);
         smooth.iter().map(|share| TRUST * (2.0 * f64::from(*share) - 1.0)).collect()
@@ -370,12 +373,34 @@ mod tests {
         // The ring goes around the middle as the middle's own surroundings do not: by colours alone both are the object.
         let found = |known| object_in(&picture, BOX, known).unwrap();
         assert!(wrong(&found(Known::default()), is_middle) > area);
-        let place = |[x, y]: [f64; 2]| from_middle(y as usize * WIDTH + x as usize) < 0.45;
+        let place = |[x, y]: [f64; 2]| Some(from_middle(y as usize * WIDTH + x as usize) < 0.45);
         let by_place = found(Known { place: Some(&place), ..Known::default() });
         assert!(wrong(&by_place, is_middle) < area / 10, "{} of {area}", wrong(&by_place, is_middle));
         let blue = [[-0.8, -0.6, 0.7], [-0.75, -0.55, 0.65], [-0.85, -0.65, 0.75]].repeat(20);
         let by_colours = found(Known { colours: &blue, place: None });
         assert!(wrong(&by_colours, is_middle) < area / 10, "{} of {area}", wrong(&by_colours, is_middle));
+    }
+
+    #[test]
+    fn what_is_seen_through_an_object_is_none_of_it() {
+        let mut picture = picture();
+        let is_window = |i: usize| from_middle(i) < 0.4;
+        for i in (0..WIDTH * picture.height).filter(|&i| is_window(i)) {
+            // Surroundings of the same row.
+            let from = 3 * (i - i % WIDTH + (i + 7) % 20);
+            picture.data.copy_within(from..from + 3, 3 * i);
+        }
+        let is_object = |i: usize| (0.4..1.0).contains(&from_middle(i));
+        let area = (0..WIDTH * picture.height).filter(|&i| is_window(i)).count();
+        let by = |within: Option<bool>| {
+            let place = |[x, y]: [f64; 2]| match from_middle(y as usize * WIDTH + x as usize) {
+                far if far < 0.4 => within,
+                far => Some(far < 1.0),
+            };
+            wrong(&object_in(&picture, BOX, Known { place: Some(&place), ..Known::default() }).unwrap(), is_object)
+        };
+        assert!(by(None) < area / 5, "{} of {area}", by(None));
+        assert!(by(Some(true)) > by(None), "{} {}", by(Some(true)), by(None));
     }
 
     #[test]

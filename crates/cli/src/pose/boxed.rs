@@ -83,7 +83,7 @@ impl Boxed<'_> {
         let mut anew = Vec::new();
         for (&number, Outcome { picture, found, .. }) in numbers.iter().zip(&first) {
             let object = FoundObject::of(picture, &found.world_from_camera, self.on, 1)?;
-            let cut = (self.open)(number, Known { colours: &[], place: Some(&|at| object.covers(at)) });
+            let cut = (self.open)(number, Known { colours: &[], place: Some(&|at| object.shows(at)) });
             // Or nothing, where the pose is far off.
             anew.push(cut.unwrap_or_else(|_| picture.clone()));
         }

@@ -15,6 +15,8 @@ const AS_EXPECTED: f64 = 0.9;
 /// As long as poses are not to be trusted, the object is searched for all around in every so many frames.
 const SEARCHED: usize = 10;
 
+/// A frame, cut out by a box and what is known of the object in it.
+pub type Open<'a> = &'a dyn Fn(BoundingBox, Known) -> Result<Picture>;
 /// Watches a search.
 type Observe<'a> = &'a mut dyn FnMut(Progress) -> std::result::Result<(), Error>;
 
@@ -35,8 +37,7 @@ pub struct Looking<'a> {
     pub search: &'a Search,
     /// Where it starts.
     pub starts: &'a dyn Fn(&Picture) -> Result<Vec<DMat4>>,
-    /// The frame, cut out by a box and what is known of the object in it.
-    pub open: &'a dyn Fn(BoundingBox, Known) -> Result<Picture>,
+    pub open: Open<'a>,
 }
 
 impl Follower {
@@ -46,13 +47,11 @@ impl Follower {
     }
 
     /// A frame, cut out by where the object is expected in it.
-    pub fn open(&mut self, open: &dyn Fn(BoundingBox, Known) -> Result<Picture>) -> Result<Picture> {
-        let picture = match &self.expected {
+    pub fn open(&self, open: Open) -> Result<Picture> {
+        match &self.expected {
             Some(object) => cut_out(self.bounds, object, open),
             None => open(self.bounds, Known::default()),
-        };
-        self.doubted += usize::from(picture.is_err());
-        picture
+        }
     }
 
     /// Finds the pose in a frame that [`Follower::open`] has cut out; the frame comes back as it was cut out in the end.
@@ -64,26 +63,22 @@ impl Follower {
         observe: Observe,
     ) -> Result<(Picture, Tracked)> {
         let near = self.near(&picture, tracker, looking, observe)?;
-        let is_trusted = near.as_ref().is_some_and(|(_, found)| found.is_trusted());
+        let is_due = |found: &Found| !found.is_trusted() && self.doubted.is_multiple_of(SEARCHED);
         let around = match &near {
-            _ if is_trusted || !self.doubted.is_multiple_of(SEARCHED) => None,
-            // Where the box is empty, the pose nearby is all there is.
-            Some(_) => (looking.open)(self.bounds, Known::default()).ok(),
+            Some((_, found)) if is_due(found) => (looking.open)(self.bounds, Known::default()).ok(),
+            Some(_) => None,
             None => Some(picture),
         };
         let around = around.map(|picture| self.around(picture, looking, observe)).transpose()?;
-        let (picture, found, is_searched) = match (near, around) {
-            (Some((picture, found)), around)
-                if around.as_ref().is_none_or(|(_, other)| !other.is_trusted() && other.unexplained >= found.unexplained) =>
-            {
-                (picture, found, false)
-            }
-            (_, Some((picture, found))) => {
-                tracker.restart(found.world_from_camera);
-                (picture, found, true)
-            }
-            (_, None) => return Err("nothing was searched for".into()),
+        let is_better = |(_, other): &(Picture, Found)| {
+            other.is_trusted() || near.as_ref().is_none_or(|(_, found)| other.unexplained < found.unexplained)
         };
+        let around = around.filter(is_better);
+        let is_searched = around.is_some();
+        let (picture, found) = around.or(near).ok_or("no pose was looked for")?;
+        if is_searched {
+            tracker.restart(found.world_from_camera);
+        }
         self.doubted = if found.is_trusted() { 0 } else { self.doubted + 1 };
         let next = tracker.expected().unwrap_or(found.world_from_camera);
         let object = FoundObject::of(&picture, &next, looking.on, 1)?;
@@ -129,5 +124,5 @@ impl Follower {
 }
 
 fn cut_out(bounds: BoundingBox, object: &FoundObject, open: &dyn Fn(BoundingBox, Known) -> Result<Picture>) -> Result<Picture> {
-    open(bounds, Known { colours: &[], place: Some(&|at| object.covers(at)) })
+    open(bounds, Known { colours: &[], place: Some(&|at| object.shows(at)) })
 }

@@ -76,9 +76,20 @@ impl FoundObject {
 
     /// Whether it covers a place, in pixels; their edges are whole numbers.
     pub fn covers(&self, at: [f64; 2]) -> bool {
+        self.silhouette.covers(self.in_view(at))
+    }
+
+    /// Whether a place shows it; of white within its outline nobody knows.
+    pub fn shows(&self, at: [f64; 2]) -> Option<bool> {
+        let at = self.in_view(at);
+        (!self.silhouette.is_enclosed(at)).then(|| self.silhouette.covers(at))
+    }
+
+    /// A place of the picture in the view, 0 to 1 across and down.
+    fn in_view(&self, at: [f64; 2]) -> [f64; 2] {
         let (corner, extent) = self.square;
         let in_square = [0, 1].map(|k| (at[k] - corner[k] as f64) / extent as f64);
-        self.silhouette.covers(in_square.map(|x| (x - 0.5) / WIDER as f64 + 0.5))
+        in_square.map(|x| (x - 0.5) / WIDER as f64 + 0.5)
     }
 }
 
@@ -89,6 +100,8 @@ struct Silhouette {
     darkness: Vec<f32>,
     /// Half as dark as the object is, by its median: between object and background pixels are of both.
     limit: f32,
+    /// White that no way leads to from the edge: print on the object, or what is seen through it.
+    enclosed: Vec<bool>,
 }
 
 impl Silhouette {
@@ -98,10 +111,10 @@ impl Silhouette {
         let mut object: Vec<f32> = darkness.iter().copied().filter(|&d| d > 0.2).collect();
         object.sort_by(f32::total_cmp);
         let limit = object.get(object.len() / 2).map_or(f32::INFINITY, |median| 0.5 * median);
-        Silhouette { side, darkness, limit }.filled()
+        Silhouette { side, darkness, limit, enclosed: vec![] }.filled()
     }
 
-    /// White that no way leads to from the edge is print on the object, not background.
+    /// What is enclosed counts as object.
     fn filled(mut self) -> Self {
         let n = self.side;
         let mut reached = vec![false; n * n];
@@ -116,7 +129,8 @@ impl Silhouette {
             next.extend(around.into_iter().chain(above).flatten());
         }
         let limit = self.limit;
-        let enclosed = self.darkness.iter_mut().zip(reached).filter(|(darkness, reached)| !reached && **darkness <= limit);
+        self.enclosed = self.darkness.iter().zip(reached).map(|(darkness, reached)| !reached && *darkness <= limit).collect();
+        let enclosed = self.darkness.iter_mut().zip(&self.enclosed).filter(|(_, is_enclosed)| **is_enclosed);
         enclosed.for_each(|(darkness, _)| *darkness = 2.0 * limit);
         self
     }
@@ -131,6 +145,12 @@ impl Silhouette {
         };
         let ends = cells.fold(None, around)?;
         Some(ends.map(|end| end.map(|cells| cells as f64 / self.side as f64)))
+    }
+
+    fn is_enclosed(&self, at: [f64; 2]) -> bool {
+        let [x, y] = at.map(|x| (x * self.side as f64).floor());
+        let is_in = [x, y].iter().all(|x| (0.0..self.side as f64).contains(x));
+        is_in && self.enclosed[y as usize * self.side + x as usize]
     }
 
     /// Whether the object covers a place of the view, 0 to 1 across and down; smooth between pixels.
@@ -190,7 +210,21 @@ mod tests {
         let rgb: Vec<f32> = (0..64).flat_map(|i| [if ring(i) && !hole(i) { -1.0 } else { 1.0 }; 3]).collect();
         let silhouette = Silhouette::of(&rgb, 8);
         assert!(silhouette.covers([0.5, 0.5]) && silhouette.covers([0.3, 0.5]) && !silhouette.covers([0.1, 0.5]));
+        assert!(silhouette.is_enclosed([0.5, 0.5]) && !silhouette.is_enclosed([0.3, 0.5]) && !silhouette.is_enclosed([0.1, 0.5]));
+        assert_eq!(silhouette.bounds(), Some([[0.25; 2], [0.75; 2]]));
+        // In a square that begins at (10, 20) and is 4 pixels wide, of which the view shows twice as much.
+        let object = |x: i64| FoundObject { silhouette: Silhouette::of(&rgb, 8), square: ([x, 20], 4) };
+        let bounds = object(10).bounds().unwrap();
+        assert_eq!((bounds.corner, bounds.size), ([10.0, 20.0], [4.0; 2]));
+        assert_eq!(
+            (object(10).shows([10.3, 22.0]), object(10).shows([12.0, 22.0]), object(10).shows([9.0, 22.0])),
+            (Some(true), None, Some(false))
+        );
+        let by_a_quarter = object(10).overlap(&object(11));
+        assert!(object(10).overlap(&object(10)) == 1.0 && (by_a_quarter - 0.6).abs() < 0.05, "{by_a_quarter}");
+        assert_eq!(object(10).overlap(&object(30)), 0.0);
         // A white view has no outline.
-        assert!(!Silhouette::of(&[1.0; 192], 8).covers([0.5, 0.5]));
+        let nothing = Silhouette::of(&[1.0; 192], 8);
+        assert!(!nothing.covers([0.5, 0.5]) && nothing.bounds().is_none());
     }
 }

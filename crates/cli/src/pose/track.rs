@@ -133,7 +133,7 @@ pub fn run(args: &Track) -> Result<bool> {
         let path = path?;
         let (began, mut bar) = (Instant::now(), None::<ProgressBar>);
         let boxed = |bounds: BoundingBox, known: Known| open(&path, Some(Cutout::Box(bounds, known)));
-        let picture = match &mut follower {
+        let picture = match &follower {
             Some(follower) => follower.open(&boxed),
             None => open(&path, args.cutout.as_deref().map(Cutout::Mask)),
         };
