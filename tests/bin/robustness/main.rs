@@ -1,7 +1,8 @@
-//! `robustness [TABLE…] [--seed N] [--starts STARTS]`: pictures like photographs of the asset objects, spoiled in known ways, and how far off `sigma-pose estimate` ends: tables
+//! `robustness [TABLE…] [--seed N] [--starts STARTS]`: pictures like photographs of the asset objects, spoiled in known ways, and how far off `sigma-pose` ends: tables
 //! of `docs/accuracy.md`. The pictures are left in `demo/robustness`.
 
 mod photo;
+mod video;
 
 use std::error::Error;
 use std::io::IsTerminal;
@@ -16,11 +17,11 @@ use serde_json::Value;
 use srn_data::sheet;
 
 use crate::photo::{Lit, OUTSIDE, Photo, SIDE, Spoil, Spoiled, exposed};
+use crate::video::Video;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str =
-    "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [others] [--seed N] [--starts STARTS]";
+const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [others] [video] [--seed N] [--starts STARTS]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -181,17 +182,18 @@ fn main() -> ExitCode {
 }
 
 fn run() -> Result<()> {
-    let (mut wanted, mut seed, mut starts) = (Vec::new(), 23, "around2016".to_string());
+    let (mut wanted, mut has_video, mut seed, mut starts) = (Vec::new(), false, 23, "around2016".to_string());
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
             "--seed" => seed = arguments.next().and_then(|text| text.parse().ok()).ok_or(USAGE)?,
             "--starts" => starts = arguments.next().ok_or(USAGE)?,
+            "video" => has_video = true,
             name => wanted.push(TABLES.iter().find(|table| table.name == name).ok_or(USAGE)?),
         }
     }
-    if wanted.is_empty() {
-        wanted.extend(&TABLES);
+    if wanted.is_empty() && !has_video {
+        (wanted, has_video) = (TABLES.iter().collect(), true);
     }
     let programs = Programs { folder: std::env::current_exe()?.parent().ok_or("no folder")?.into(), starts };
     let mut shown = Vec::new();
@@ -202,7 +204,7 @@ fn run() -> Result<()> {
              truth in the stated 95 %, of these |\n|---|---|---|---|---|---|---|---|"
         );
         for row in table.rows {
-            let views = programs.rendered(row, seed)?;
+            let views = programs.views(row, seed)?;
             let folder = Path::new(OUT).join(table.name).join(row.what.replace([' ', ',', '°', '/'], "-"));
             let pictures = spoiled(row, &views, &folder, seed)?;
             shown.push((pictures[SHOWN].small()?, row.what));
@@ -228,8 +230,32 @@ fn run() -> Result<()> {
             }
         }
     }
+    if has_video {
+        videos(&programs, seed)?;
+    }
+    if shown.is_empty() {
+        return Ok(());
+    }
     let cells: Vec<_> = shown.iter().map(|(picture, what)| (picture, *what)).collect();
     sheet::grid(&cells, COLUMNS).save(Path::new(OUT).join("sheet.png"))?;
+    Ok(())
+}
+
+/// The table of videos.
+fn videos(programs: &Programs, seed: u64) -> Result<()> {
+    println!("\nvideo, seed {seed}, made in {OUT}\n");
+    println!(
+        "| | effort | frames | rotation, mean / median / worst | translation, mean / median | more than 5° off | trusted, of these wrong | \
+         searched all around | a frame, median |\n|---|---|---|---|---|---|---|---|---|"
+    );
+    let folder = Path::new(OUT).join("views-of-video");
+    programs
+        .rendered(&folder, &[("--cameras", "spiral"), ("--views", &video::VIEWS.to_string()), ("--focal", &FOCAL.to_string())])?;
+    let mut random = Pcg64Mcg::seed_from_u64(seed);
+    for object in 0..OBJECTS.len() {
+        let video = Video::new(object, &folder, &mut random)?;
+        println!("{}", video::tracked(programs, &video, "normal")?);
+    }
     Ok(())
 }
 
@@ -277,30 +303,28 @@ impl Programs {
         Command::new(self.folder.join(format!("{name}{}", std::env::consts::EXE_SUFFIX)))
     }
 
-    /// Views of all objects, as a data set.
-    fn rendered(&self, row: &Row, seed: u64) -> Result<PathBuf> {
+    /// Views of all objects for a row, as a data set.
+    fn views(&self, row: &Row, seed: u64) -> Result<PathBuf> {
         let &Row { distance, focal, is_rolled, .. } = row;
         let folder = Path::new(OUT).join(format!("views-{distance}{}", if is_rolled { "-rolled" } else { "" }));
+        let [views, radius, focal, seed] = [VIEWS.to_string(), distance.to_string(), focal.to_string(), seed.to_string()];
+        let mut flags =
+            vec![("--cameras", "sphere"), ("--views", &*views), ("--radius", &radius), ("--focal", &focal), ("--seed", &seed)];
+        flags.extend(is_rolled.then_some(("--roll", "")));
+        self.rendered(&folder, &flags)?;
+        Ok(folder)
+    }
+
+    /// Renders all objects into a folder.
+    fn rendered(&self, folder: &Path, flags: &[(&str, &str)]) -> Result<()> {
         let mesh = |(name, file): (&str, &str)| {
             format!("{name}={}", if file.ends_with(".dat") { format!("{LDRAW}/{file}") } else { file.into() })
         };
         let mut render = self.command("sigma-data");
-        render.arg("render").args(OBJECTS.map(mesh)).args(["--cameras", "sphere", "--force", "--out"]).arg(&folder);
-        for (flag, value) in [
-            ("--views", VIEWS.to_string()),
-            ("--radius", distance.to_string()),
-            ("--side", SIDE.to_string()),
-            ("--focal", focal.to_string()),
-            ("--seed", seed.to_string()),
-        ] {
-            render.args([flag, &value]);
-        }
-        render.args(is_rolled.then_some("--roll"));
+        render.arg("render").args(OBJECTS.map(mesh)).args(["--side", &SIDE.to_string(), "--force", "--out"]).arg(folder);
+        render.args(flags.iter().flat_map(|(flag, value)| [*flag, *value]).filter(|word| !word.is_empty()));
         let output = render.output()?;
-        match output.status.success() {
-            true => Ok(folder),
-            false => Err(said(&output)),
-        }
+        if output.status.success() { Ok(()) } else { Err(said(&output)) }
     }
 
     /// What the search finds of an object's pictures.

@@ -50,7 +50,7 @@ pub enum Spoil {
 
 /// A picture of an object on a table.
 pub struct Photo {
-    picture: RgbImage,
+    pub picture: RgbImage,
     /// What of it is the object.
     object: GrayImage,
 }

@@ -24,12 +24,17 @@ const LEAST_HEIGHT: u32 = 320;
 
 /// Writes `NAME-outline.png` of the picture at `path` to `dir`.
 pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, on: On) -> Result<()> {
-    let object = FoundObject::of(picture, &found.world_from_camera, on, FINEST)?;
+    write_picture(&dir.join(format!("{}-outline.png", picture.name)), &drawn(path, picture, found, on, FINEST)?)
+}
+
+/// The picture at `path` with the outline on it, by a view at most so many times as fine as the model's own.
+pub fn drawn(path: &Path, picture: &Picture, found: &Found, on: On, finest: usize) -> Result<RgbImage> {
+    let object = FoundObject::of(picture, &found.world_from_camera, on, finest)?;
     let photo = Pixels::open(path)?.to_rgb8();
     let factor = LEAST_HEIGHT.div_ceil(photo.height());
     let mut page = sheet::enlarge(&photo, factor);
     draw(&mut page, |at| object.covers(at.map(|x| (x as f64 + 0.5) / f64::from(factor))));
-    write_picture(&dir.join(format!("{}-outline.png", picture.name)), &page)
+    Ok(page)
 }
 
 /// Where the model shows the found object in the picture as it is on disk.

@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
+use image::RgbImage;
+use image::imageops::{self, FilterType};
 use indicatif::ProgressBar;
 use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Tracked, Tracker};
@@ -18,6 +20,7 @@ use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side
 use super::follow::{Follower, Looking};
 use super::mask::MadeRight;
 use super::notation::{NotationArgs, ObjectPose};
+use super::outline;
 use super::search::{On, PoseError, SearchArgs, Starts, deviation, query, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, lossy, print, refuse_to_write};
 use crate::progress;
@@ -59,7 +62,7 @@ pub struct Track {
     /// Print a line of JSON per frame; one that is no picture has `frame`, `trusted` and `failure` alone.
     #[arg(long)]
     json: bool,
-    /// Write an animation as it grows: each frame beside the view from its pose.
+    /// Write an animation as it grows: each frame beside the view from its pose; with --box the outline of what was found on the whole frame, too.
     #[arg(long, value_name = "GIF")]
     record: Option<PathBuf>,
     /// Overwrite the file of --record.
@@ -208,12 +211,14 @@ pub fn run(args: &Track) -> Result<bool> {
         let error = truth.map(|truth| notation.error(PoseError::of(&found.world_from_camera, &truth)));
         errors.extend(error);
         searches += usize::from(searched);
-        if let Some(path) = &args.record {
+        if let Some(file) = &args.record {
             let animation = match &mut animation {
                 Some(animation) => animation,
-                none => none.insert(Animation::create(path)?),
+                none => none.insert(Animation::create(file)?),
             };
-            animation.push(side_by_side(&picture, &found, side), STAY)?;
+            // What is cut out is best seen on the frame that it was cut out of.
+            let whole = follower.as_ref().map(|_| outline::drawn(&path, &picture, &found, on, 1)).transpose()?;
+            animation.push(side_by_side(whole, &picture, &found, side), STAY)?;
         }
         let written = notation.written(&found.world_from_camera);
         let report = FrameReport {
@@ -306,15 +311,22 @@ fn numbered(name: &str) -> Vec<(String, u128)> {
     parts
 }
 
-fn side_by_side(picture: &Picture, found: &Found, side: u32) -> image::RgbImage {
+fn side_by_side(whole: Option<RgbImage>, picture: &Picture, found: &Found, side: u32) -> RgbImage {
+    let whole = whole.map(|whole| {
+        let width = (whole.width() * SHOWN).div_ceil(whole.height());
+        imageops::resize(&whole, width, SHOWN, FilterType::Triangle)
+    });
     let views = [
         draw::view(&picture.rgb, side, SHOWN),
         draw::view(&found.view, side, SHOWN),
         draw::difference(&found.estimate.target, &found.view, side, SHOWN),
     ];
-    let mut row = image::RgbImage::new(3 * views[0].width(), views[0].height());
-    for (view, k) in views.iter().zip(0i64..) {
-        image::imageops::replace(&mut row, view, k * i64::from(view.width()), 0);
+    let panels: Vec<RgbImage> = whole.into_iter().chain(views).collect();
+    let mut row = RgbImage::new(panels.iter().map(RgbImage::width).sum(), SHOWN);
+    let mut left = 0;
+    for panel in panels {
+        imageops::replace(&mut row, &panel, left, 0);
+        left += i64::from(panel.width());
     }
     row
 }
