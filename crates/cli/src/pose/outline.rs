@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use glam::DMat4;
+use image::imageops::{self, FilterType};
 use image::{Rgb, RgbImage};
 use sigma_srn::{Found, Intrinsics};
 use srn_data::pixels::Pixels;
@@ -24,17 +25,24 @@ const LEAST_HEIGHT: u32 = 320;
 
 /// Writes `NAME-outline.png` of the picture at `path` to `dir`.
 pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, on: On) -> Result<()> {
-    write_picture(&dir.join(format!("{}-outline.png", picture.name)), &drawn(path, picture, found, on, FINEST)?)
+    let photo = Pixels::open(path)?.to_rgb8();
+    let page = sheet::enlarge(&photo, LEAST_HEIGHT.div_ceil(photo.height()));
+    let object = FoundObject::of(picture, &found.world_from_camera, on, FINEST)?;
+    write_picture(&dir.join(format!("{}-outline.png", picture.name)), &outlined(page, photo.height(), &object))
 }
 
-/// The picture at `path` with the outline on it, by a view at most so many times as fine as the model's own.
-pub fn drawn(path: &Path, picture: &Picture, found: &Found, on: On, finest: usize) -> Result<RgbImage> {
-    let object = FoundObject::of(picture, &found.world_from_camera, on, finest)?;
+/// The picture at `path`, so many pixels high, with the outline on it, which is as fine as the model's own view.
+pub fn shown(path: &Path, picture: &Picture, found: &Found, on: On, height: u32) -> Result<RgbImage> {
     let photo = Pixels::open(path)?.to_rgb8();
-    let factor = LEAST_HEIGHT.div_ceil(photo.height());
-    let mut page = sheet::enlarge(&photo, factor);
-    draw(&mut page, |at| object.covers(at.map(|x| (x as f64 + 0.5) / f64::from(factor))));
-    Ok(page)
+    let page = imageops::resize(&photo, (photo.width() * height).div_ceil(photo.height()), height, FilterType::Triangle);
+    Ok(outlined(page, photo.height(), &FoundObject::of(picture, &found.world_from_camera, on, 1)?))
+}
+
+/// A page that shows a picture of this height.
+fn outlined(mut page: RgbImage, height: u32, object: &FoundObject) -> RgbImage {
+    let pixel = f64::from(height) / f64::from(page.height());
+    draw(&mut page, |at| object.covers(at.map(|x| (x as f64 + 0.5) * pixel)));
+    page
 }
 
 /// Where the model shows the found object in the picture as it is on disk.

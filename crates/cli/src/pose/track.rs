@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use image::RgbImage;
-use image::imageops::{self, FilterType};
 use indicatif::ProgressBar;
 use serde::Serialize;
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Tracked, Tracker};
@@ -217,7 +216,7 @@ pub fn run(args: &Track) -> Result<bool> {
                 none => none.insert(Animation::create(file)?),
             };
             // What is cut out is best seen on the frame that it was cut out of.
-            let whole = follower.as_ref().map(|_| outline::drawn(&path, &picture, &found, on, 1)).transpose()?;
+            let whole = follower.as_ref().map(|_| outline::shown(&path, &picture, &found, on, SHOWN)).transpose()?;
             animation.push(side_by_side(whole, &picture, &found, side), STAY)?;
         }
         let written = notation.written(&found.world_from_camera);
@@ -312,10 +311,6 @@ fn numbered(name: &str) -> Vec<(String, u128)> {
 }
 
 fn side_by_side(whole: Option<RgbImage>, picture: &Picture, found: &Found, side: u32) -> RgbImage {
-    let whole = whole.map(|whole| {
-        let width = (whole.width() * SHOWN).div_ceil(whole.height());
-        imageops::resize(&whole, width, SHOWN, FilterType::Triangle)
-    });
     let views = [
         draw::view(&picture.rgb, side, SHOWN),
         draw::view(&found.view, side, SHOWN),
@@ -325,7 +320,7 @@ fn side_by_side(whole: Option<RgbImage>, picture: &Picture, found: &Found, side:
     let mut row = RgbImage::new(panels.iter().map(RgbImage::width).sum(), SHOWN);
     let mut left = 0;
     for panel in panels {
-        imageops::replace(&mut row, &panel, left, 0);
+        image::imageops::replace(&mut row, &panel, left, 0);
         left += i64::from(panel.width());
     }
     row
