@@ -884,7 +884,7 @@ fn a_box_around_the_object_is_enough() {
     assert_eq!(files(&dir.join("out")), ["seat-photo-outline.png", "seat-photo.gif", "seat-photo.png"]);
 }
 
-/// The seat goes to the right, and once something is before the whole camera.
+/// The seat goes to the right; once something is before the whole camera, and once before the seat.
 #[test]
 fn a_box_in_the_first_frame_is_enough() {
     let home = TempDir::new().unwrap();
@@ -892,19 +892,25 @@ fn a_box_in_the_first_frame_is_enough() {
     fs::write(dir.join("camera.txt"), "74.4 82 62 0.\n0. 0. 0.\n1.\n128 160\n").unwrap();
     fs::create_dir(dir.join("frames")).unwrap();
     let mut boxes = vec![];
-    for k in 0..5 {
+    for k in 0..7 {
         boxes.push(on_a_table([50 + 3 * k, 30], &dir.join(format!("frames/{k}.png"))));
     }
-    image::RgbImage::from_pixel(160, 128, image::Rgb([9; 3])).save(dir.join("frames/2.png")).unwrap();
+    let frame = |k: usize| dir.join(format!("frames/{k}.png"));
+    image::RgbImage::from_pixel(160, 128, image::Rgb([9; 3])).save(frame(2)).unwrap();
+    let mut hidden = image::open(frame(5)).unwrap().into_rgb8();
+    let hand = |x: u32, y: u32| image::Rgb([200 + (x % 7) as u8, 150 + (y % 5) as u8, 120]);
+    let is_hand = |x: u32, y: u32| (60..120).contains(&x) && y > 34;
+    hidden.enumerate_pixels_mut().filter(|(x, y, _)| is_hand(*x, *y)).for_each(|(x, y, pixel)| *pixel = hand(x, y));
+    hidden.save(frame(5)).unwrap();
     let args = format!("--intrinsics camera.txt --model {SHIPPED} --instance seat --executor cpu --effort fast --json");
     let track = format!("track frames --box {} {args}", boxes[0]);
     let lines = |printed: &str| -> Vec<Value> { printed.lines().map(|line| serde_json::from_str(line).unwrap()).collect() };
     let each = |lines: &[Value], of: &str| lines.iter().map(|line| line[of].as_bool()).collect::<Vec<_>>();
     let frames = lines(&run(dir, &format!("{track} --record track.gif"), 0));
-    assert_eq!(each(&frames, "trusted"), [true, true, false, true, true].map(Some));
-    assert_eq!(each(&frames, "searched"), [Some(true), Some(false), None, Some(false), Some(false)]);
+    assert_eq!(each(&frames, "trusted"), [true, true, false, true, true, false, true].map(Some));
+    assert_eq!(each(&frames, "searched")[..5], [Some(true), Some(false), None, Some(false), Some(false)]);
     assert!(frames[2]["failure"].as_str().unwrap().contains("box"), "{}", frames[2]);
-    assert_eq!(frames_of(&dir.join("track.gif")), 4);
+    assert_eq!(frames_of(&dir.join("track.gif")), 5);
     // Where a search with a box finds it in the last of them, too.
     let alone = json(&run(dir, &format!("estimate frames/4.png --box {} {args}", boxes[4]), 0))["images"][0].take();
     let position = |found: &Value| {
@@ -917,7 +923,7 @@ fn a_box_in_the_first_frame_is_enough() {
     // What is not to be trusted is followed all the same, and searched for all around in the first of ten; with a rough pose 30° from that.
     fs::copy(format!("{TEST}/seat/pose/000006.txt"), dir.join("rough.txt")).unwrap();
     let doubted = lines(&run(dir, &format!("{track} --rough rough.txt --accept 1e-9"), 1));
-    assert_eq!(each(&doubted, "searched"), [Some(true), Some(false), None, Some(false), Some(false)]);
+    assert_eq!(each(&doubted, "searched"), [Some(true), Some(false), None, Some(false), Some(false), Some(false), Some(false)]);
     assert!(doubted[4]["trusted"] == false && doubted[4]["doubt"] == "unexplained", "{}", doubted[4]);
     fail(dir, &format!("{track} --cutout masks"), &["--box", "--cutout"]);
     fail(dir, &format!("track frames --box 500,9,9,9 {args}"), &["0.png", "box 500,9,9,9"]);

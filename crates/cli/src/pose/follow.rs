@@ -22,10 +22,10 @@ type Observe<'a> = &'a mut dyn FnMut(Progress) -> std::result::Result<(), Error>
 
 /// Follows an object of which nothing but a box around it in the first frame is known.
 pub struct Follower {
-    /// A box around the object.
+    /// A box around the object, where it was last seen for sure.
     bounds: BoundingBox,
-    /// What it is expected to cover in the next frame.
-    expected: Option<FoundObject>,
+    /// What it is expected to cover in the next frame, and a box around that.
+    expected: Option<(FoundObject, BoundingBox)>,
     /// Frames in a row whose poses were not to be trusted.
     doubted: usize,
 }
@@ -46,12 +46,10 @@ impl Follower {
         Follower { bounds, expected: None, doubted: 0 }
     }
 
-    /// A frame, cut out by where the object is expected in it.
+    /// A frame, cut out by where the object is expected in it; if nothing is there, by the box alone.
     pub fn open(&self, open: Open) -> Result<Picture> {
-        match &self.expected {
-            Some(object) => cut_out(self.bounds, object, open),
-            None => open(self.bounds, Known::default()),
-        }
+        let expected = self.expected.as_ref().and_then(|(object, bounds)| cut_out(*bounds, object, open).ok());
+        expected.map_or_else(|| open(self.bounds, Known::default()), Ok)
     }
 
     /// Finds the pose in a frame that [`Follower::open`] has cut out; the frame comes back as it was cut out in the end.
@@ -83,7 +81,11 @@ impl Follower {
         let next = tracker.expected().unwrap_or(found.world_from_camera);
         let object = FoundObject::of(&picture, &next, looking.on, 1)?;
         if let Some(bounds) = object.bounds() {
-            (self.bounds, self.expected) = (bounds, Some(object));
+            // What is followed in doubt may be something else, which leads away.
+            if found.is_trusted() {
+                self.bounds = bounds;
+            }
+            self.expected = Some((object, bounds));
         }
         Ok((picture, Tracked { found, is_searched }))
     }
@@ -96,7 +98,7 @@ impl Follower {
         looking: &Looking,
         observe: Observe,
     ) -> Result<Option<(Picture, Found)>> {
-        let (Some(expected), side) = (&self.expected, looking.on.side) else { return Ok(None) };
+        let (Some((expected, _)), side) = (&self.expected, looking.on.side) else { return Ok(None) };
         let Some(found) = tracker.follow(query(picture, side, &[]), &mut *observe)? else { return Ok(None) };
         let object = FoundObject::of(picture, &found.world_from_camera, looking.on, 1)?;
         let anew = object.bounds().filter(|_| object.overlap(expected) < AS_EXPECTED);
@@ -123,6 +125,6 @@ impl Follower {
     }
 }
 
-fn cut_out(bounds: BoundingBox, object: &FoundObject, open: &dyn Fn(BoundingBox, Known) -> Result<Picture>) -> Result<Picture> {
+fn cut_out(bounds: BoundingBox, object: &FoundObject, open: Open) -> Result<Picture> {
     open(bounds, Known { colours: &[], place: Some(&|at| object.shows(at)) })
 }
