@@ -253,9 +253,24 @@ pub fn psnr(rendered: &[f32], target: &[f32]) -> f64 {
     10.0 * (4.0 * target.len() as f64 / squares.sum::<f64>()).log10()
 }
 
+/// `n` of the items, evenly spaced; the first among them.
+pub fn spread<T>(items: Vec<T>, n: usize) -> Vec<T> {
+    let (len, n) = (items.len(), n.min(items.len()));
+    let chosen: Vec<usize> = (0..n).map(|k| k * len / n).collect();
+    items.into_iter().enumerate().filter(|(i, _)| chosen.contains(i)).map(|(_, item)| item).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn views_are_spread_evenly() {
+        assert_eq!(spread((0..20).collect(), 4), [0, 5, 10, 15]);
+        assert_eq!(spread((0..3).collect(), 10), [0, 1, 2]);
+        assert_eq!(spread((0..7).collect(), 3), [0, 2, 4]);
+        assert!(spread(Vec::<u8>::new(), 3).is_empty());
+    }
 
     #[test]
     fn memory_sizes() {

@@ -201,6 +201,8 @@ fn training_learns_and_writes_what_a_person_wants_to_see() {
     assert!(model.layout.density.is_none() && model.layout.features() == 16);
     assert_eq!((model.metadata.side, model.metadata.instance_names.len()), (Some(16), 9));
     assert_eq!(model.metadata.ray_sphere, model.metadata.orbit_radius);
+    let unexplained = &model.metadata.unexplained;
+    assert!(unexplained.len() == 9 && unexplained.values().all(|&part| part > 0.01), "{unexplained:?}");
     let [nearest, farthest] = model.metadata.distances.unwrap();
     assert!([nearest, model.metadata.orbit_radius.unwrap(), farthest].iter().all(|distance| (distance - 1.3).abs() < 1e-3));
 }

@@ -16,6 +16,7 @@ fn fuzz_model() {
     model.metadata.instance_names = vec!["a".into(), "b".into()];
     model.metadata.distances = Some([1.1, 1.5]);
     model.metadata.ray_sphere = Some(1.3);
+    model.metadata.unexplained = [("a".into(), 0.1)].into();
     model.save(&path).unwrap();
     let good = std::fs::read(&path).unwrap();
     assert_eq!(Model::load(&path).unwrap(), model);

@@ -14,8 +14,8 @@ use super::heldout::Heldout;
 use super::notation::Notation;
 use super::search::{self, On, PoseError, SearchArgs, Starts, render};
 use super::symmetry::Symmetries;
-use super::views::{self, Views, spread};
-use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write};
+use super::views::{self, Views};
+use crate::common::{EngineArgs, Result, load_model, print, refuse_to_write, spread};
 use crate::progress;
 use crate::train::adapt::Fit;
 

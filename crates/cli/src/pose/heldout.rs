@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use sigma_srn::{Engine, Model};
 use srn_data::{Dataset, Instance, LoadedView};
 
-use super::views::{self, Views, spread};
-use crate::common::{Result, load_set};
+use super::views::{self, Views};
+use crate::common::{Result, load_set, spread};
 use crate::train::Shown;
 use crate::train::adapt::Fit;
 

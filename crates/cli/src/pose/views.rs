@@ -10,7 +10,7 @@ use srn_data::srn::SrnSet;
 use super::files::{Picture, model_side};
 use super::notation::Notation;
 use super::search::{On, SearchArgs, Starts, run};
-use crate::common::{Result, camera};
+use crate::common::{Result, camera, spread};
 use crate::progress;
 
 /// Views of one instance.
@@ -110,24 +110,4 @@ pub fn picture(view: LoadedView, instance: u32, side: u32) -> (Picture, DMat4) {
         },
         truth,
     )
-}
-
-/// `n` of the items, evenly spaced; the first among them.
-pub fn spread<T>(items: Vec<T>, n: usize) -> Vec<T> {
-    let (len, n) = (items.len(), n.min(items.len()));
-    let chosen: Vec<usize> = (0..n).map(|k| k * len / n).collect();
-    items.into_iter().enumerate().filter(|(i, _)| chosen.contains(i)).map(|(_, item)| item).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn views_are_spread_evenly() {
-        assert_eq!(spread((0..20).collect(), 4), [0, 5, 10, 15]);
-        assert_eq!(spread((0..3).collect(), 10), [0, 1, 2]);
-        assert_eq!(spread((0..7).collect(), 3), [0, 2, 4]);
-        assert!(spread(Vec::<u8>::new(), 3).is_empty());
-    }
 }

@@ -17,17 +17,19 @@ use image::RgbImage;
 use indicatif::ProgressBar;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use sigma_srn::{Engine, Losses, Metadata, Model, Random, Renderer, Train, Trainer, stream, write_atomically};
+use sigma_srn::{Engine, Losses, Metadata, Model, Random, Renderer, Train, Trainer, stream, unexplained, write_atomically};
 use srn_data::{Dataset, SrnSet, pixels, sheet};
 
 use super::{Changeable, ForGood, Preset, Settings, Shown, psnr_of_each, render, training_batch};
-use crate::common::{self, EngineArgs, Result, load_model, print, write_picture};
+use crate::common::{self, EngineArgs, Result, load_model, print, spread, write_picture};
 use crate::progress;
 
 /// Time between checkpoints.
 const CHECKPOINT_INTERVAL: Duration = Duration::from_secs(60);
 /// Time after which the loss on the terminal is old.
 const STALE: Duration = Duration::from_secs(2);
+/// Instances, and views of each, at which a trained model is looked at, at most.
+const LOOKED_AT: usize = 24;
 /// Radius of the ball around the object, object units.
 const BALL: f64 = 0.5;
 
@@ -111,6 +113,8 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         orbit_radius: Some(orbit_radius),
         ray_sphere: settings.ray_sphere,
         distances: Some(distances),
+        // How well it shows what it has learnt is known in the end.
+        unexplained: BTreeMap::new(),
         calibration: None,
         calibration_of_new: None,
     };
@@ -189,8 +193,10 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
         return Ok(false);
     }
 
+    let mut trained = trainer.model()?.clone();
+    trained.metadata.unexplained = unexplained_at_truth(&engine, &trained, &set, validation.as_ref(), settings.side)?;
     let model = run.join("model.safetensors");
-    trainer.model()?.save(&model)?;
+    trained.save(&model)?;
     let curves = run.join("curves.png");
     write_picture(&curves, &metrics.curves())?;
     let (steps, psnr) = (trainer.steps(), metrics.validation_psnr());
@@ -254,6 +260,38 @@ fn watched_views<'a>(set: &'a Dataset, validation: Option<&'a Dataset>, count: u
             Ok((number as u32, &instance.views[k * instance.views.len() / count]))
         })
         .collect()
+}
+
+/// What true poses leave unexplained, see [`Metadata::unexplained`]: of the validation's pictures where there are any.
+fn unexplained_at_truth(
+    engine: &Engine,
+    model: &Model,
+    set: &Dataset,
+    validation: Option<&Dataset>,
+    side: u32,
+) -> Result<BTreeMap<String, f64>> {
+    let mut all = BTreeMap::new();
+    let instances = spread((0..set.instances.len()).collect(), LOOKED_AT);
+    let bar = progress::bar(instances.len() as u64, "looking at views");
+    for number in instances {
+        let instance = &set.instances[number];
+        let unseen = validation.iter().flat_map(|set| &set.instances).find(|other| other.name == instance.name);
+        let views = spread(unseen.unwrap_or(instance).views.iter().collect(), LOOKED_AT);
+        let views: Vec<Shown> = views.into_iter().map(|view| (number as u32, view)).collect();
+        let rendering = render(engine, model, &views, side)?;
+        let pictures = rendering.rgb.chunks(rendering.rgb.len() / views.len());
+        let parts = pictures.zip(&views).map(|(picture, (_, view))| unexplained(&view.rgb, None, picture));
+        // A white picture leaves nothing to explain.
+        let mut parts: Vec<f64> = parts.filter(|part| part.is_finite()).collect();
+        parts.sort_by(f64::total_cmp);
+        // Masks and cameras of a tenth may be wrong.
+        if let Some(&most) = parts.get((9 * parts.len() / 10).saturating_sub(1)) {
+            all.insert(instance.name.clone(), most);
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(all)
 }
 
 /// Distances of the cameras to the origin: the median, and the nearest and the farthest.

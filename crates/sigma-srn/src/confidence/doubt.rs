@@ -41,8 +41,10 @@ impl std::fmt::Display for Doubt {
     }
 }
 
-/// What a picture may leave unexplained where there is no calibration.
+/// What a picture may leave unexplained where there is no calibration,
 const UNEXPLAINED: f64 = 0.25;
+/// and how many times what pictures of the object leave that the model has learnt from, or that its training has looked at (`docs/accuracy.md`).
+const ABOVE_LEARNT: f64 = 1.6;
 /// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on, or that is partly hidden (`docs/accuracy.md`).
 const RIVAL: f64 = 0.3;
 
@@ -72,13 +74,16 @@ impl Calibration {
 
 impl Estimate {
     /// Why it is not to be trusted, if it is not: an estimate for an instance of `model`, whose view from there leaves so much of
-    /// [`Estimate::target`] [`unexplained`]. Without a calibration a quarter may be.
+    /// [`Estimate::target`] [`unexplained`]. Without a calibration a quarter may be, or less, see [`Metadata::unexplained`].
     pub fn doubt(&self, model: &Model, instance: u32, unexplained: f64) -> Option<Doubt> {
         let picture = match &model.metadata.calibration {
             Some(calibration) => {
                 calibration.doubt(&model.instance_name(instance), unexplained, self.rival().map(|(_, higher)| higher))
             }
-            None => unexplained_doubt(unexplained, UNEXPLAINED),
+            None => {
+                let learnt = model.metadata.unexplained.get(&model.instance_name(instance));
+                unexplained_doubt(unexplained, learnt.map_or(UNEXPLAINED, |most| UNEXPLAINED.min(ABOVE_LEARNT * most)))
+            }
         };
         self.doubt_besides(&model.metadata, picture)
     }
@@ -280,6 +285,11 @@ mod tests {
             let metadata = Metadata { ray_sphere: Some(1.3), calibration, ..plain.metadata.clone() };
             Model { metadata, ..plain.clone() }
         };
+        let learnt = |most: f64| {
+            let model = model(None);
+            let unexplained = [(plain.instance_name(0), most)].into();
+            Model { metadata: Metadata { unexplained, ..model.metadata.clone() }, ..model }
+        };
         let seen = Some(Seen { distance: 1.3, extent: 0.5 });
         let calibrated = model(Some(Calibration { unexplained: 0.5, rival: 0.4, seen, ..calibration(1.0, [1.0; 6]) }));
         let strict = model(Some(Calibration { unexplained: 0.5, rival: 0.6, seen, ..calibration(1.0, [1.0; 6]) }));
@@ -300,6 +310,10 @@ mod tests {
             (&model(None), small, 0.2, None),
             (&model(None), at(1.3), 0.3, Some(Doubt::Unexplained)),
             (&model(None), at(0.6), 0.2, Some(Doubt::Distance)),
+            (&learnt(0.1), at(1.3), 0.15, None),
+            (&learnt(0.1), at(1.3), 0.17, Some(Doubt::Unexplained)),
+            (&learnt(0.2), at(1.3), 0.3, Some(Doubt::Unexplained)),
+            (&learnt(0.1), at(0.6), 0.15, Some(Doubt::Distance)),
         ] {
             assert_eq!(estimate.doubt(model, 0, part), doubt, "{part} {:?}", estimate.pose);
         }

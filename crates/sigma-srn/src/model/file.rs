@@ -1,6 +1,6 @@
 //! Models and their tensors as safetensors files.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use safetensors::SafeTensorError;
@@ -57,6 +57,8 @@ impl Model {
         let calibration = |key: &str| serde_json::from_str(json(key)).map_err(|error| wrong(key, error));
         let instance_names: Option<Vec<String>> =
             serde_json::from_str(json("instance_names")).map_err(|error| wrong("instance_names", error))?;
+        let unexplained: Option<BTreeMap<String, f64>> =
+            serde_json::from_str(json("unexplained")).map_err(|error| wrong("unexplained", error))?;
         let length = |key: &str| match number(key) {
             Some(Ok(length)) if length > 0.0 && length.is_finite() => Ok(Some(length)),
             None => Ok(None),
@@ -81,6 +83,7 @@ impl Model {
             orbit_radius: length("orbit_radius")?,
             ray_sphere: length("ray_sphere")?,
             distances: serde_json::from_str(json("distances")).map_err(|error| wrong("distances", error))?,
+            unexplained: unexplained.unwrap_or_default(),
             calibration: calibration("calibration")?,
             calibration_of_new: calibration("calibration_of_new")?,
         };
@@ -117,6 +120,9 @@ impl Model {
         }
         if let Some(distances) = self.metadata.distances {
             text.insert("distances".into(), serde_json::json!(distances).to_string());
+        }
+        if !self.metadata.unexplained.is_empty() {
+            text.insert("unexplained".into(), serde_json::json!(self.metadata.unexplained).to_string());
         }
         let Metadata { calibration, calibration_of_new, .. } = &self.metadata;
         for (key, calibration) in [("calibration", calibration), ("calibration_of_new", calibration_of_new)] {

@@ -4,6 +4,7 @@ mod file;
 mod layout;
 
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 
 pub use self::file::write_atomically;
 pub(crate) use self::file::{Tensors, read_tensors, write_tensors};
@@ -38,6 +39,9 @@ pub struct Metadata {
     pub ray_sphere: Option<f64>,
     /// The nearest and the farthest of the training cameras, but for a hundredth on each side, in object units, if known.
     pub distances: Option<[f64; 2]>,
+    /// How well it shows what it was trained on, if known: by instance, the part of a picture that the view from its true pose leaves
+    /// [`unexplained`](crate::unexplained), in nine of ten of the training's pictures, or of its validation's, at most.
+    pub unexplained: BTreeMap<String, f64>,
     /// How its estimates compare with known poses, if that was measured.
     pub calibration: Option<Calibration>,
     /// The same for objects that it was not trained on, fitted to two views each: the calibration of a model that `sigma-train adapt` makes of
@@ -198,8 +202,8 @@ impl Model {
         Ok(&self.parameters[self.hypernetwork()?.codes].values)
     }
 
-    /// The same networks with these instances alone, whose latent codes are `codes`, `[names.len(), latent]`. Without the calibration, which tells
-    /// of errors at the old ones.
+    /// The same networks with these instances alone, whose latent codes are `codes`, `[names.len(), latent]`. Without what is known of
+    /// the old ones: the calibration, and how well they are shown.
     pub fn with_codes(&self, names: Vec<String>, codes: Vec<f32>) -> Result<Self, Error> {
         let hypernetwork = self.hypernetwork()?;
         let (latent, of_codes) = (hypernetwork.latent as usize, hypernetwork.codes);
@@ -212,6 +216,7 @@ impl Model {
         model.parameters[of_codes].tensors[0].1 = vec![names.len(), latent];
         model.layout.instances = names.len() as u32;
         (model.metadata.instance_names, model.metadata.calibration) = (names, None);
+        model.metadata.unexplained.clear();
         Ok(model)
     }
 
