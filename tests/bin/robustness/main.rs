@@ -2,6 +2,7 @@
 //! of `docs/accuracy.md`. The pictures are left in `demo/robustness`.
 
 mod photo;
+mod sides;
 mod video;
 
 use std::error::Error;
@@ -21,7 +22,7 @@ use crate::video::Video;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [others] [video] [--seed N] [--starts STARTS]";
+const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [others] [sides] [video] [--seed N] [--starts STARTS]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -182,18 +183,20 @@ fn main() -> ExitCode {
 }
 
 fn run() -> Result<()> {
-    let (mut wanted, mut has_video, mut seed, mut starts) = (Vec::new(), false, 23, "around2016".to_string());
+    let (mut wanted, mut has_sides, mut has_video) = (Vec::new(), false, false);
+    let (mut seed, mut starts) = (23, "around2016".to_string());
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
             "--seed" => seed = arguments.next().and_then(|text| text.parse().ok()).ok_or(USAGE)?,
             "--starts" => starts = arguments.next().ok_or(USAGE)?,
+            "sides" => has_sides = true,
             "video" => has_video = true,
             name => wanted.push(TABLES.iter().find(|table| table.name == name).ok_or(USAGE)?),
         }
     }
-    if wanted.is_empty() && !has_video {
-        (wanted, has_video) = (TABLES.iter().collect(), true);
+    if wanted.is_empty() && !has_sides && !has_video {
+        (wanted, has_sides, has_video) = (TABLES.iter().collect(), true, true);
     }
     let programs = Programs { folder: std::env::current_exe()?.parent().ok_or("no folder")?.into(), starts };
     let mut shown = Vec::new();
@@ -230,6 +233,9 @@ fn run() -> Result<()> {
             }
         }
     }
+    if has_sides {
+        sides(&programs, seed)?;
+    }
     if has_video {
         videos(&programs, seed)?;
     }
@@ -241,6 +247,23 @@ fn run() -> Result<()> {
     Ok(())
 }
 
+/// The table of models that know an object from some sides only.
+fn sides(programs: &Programs, seed: u64) -> Result<()> {
+    println!("\nsides, seed {seed}, made in {OUT}\n");
+    println!(
+        "| | effort | trusted within 5° | trusted of those up to 10° off | trusted of those further off |\n|---|---|---|---|---|"
+    );
+    let walks = sides::walks(programs, seed)?;
+    let mut all = Vec::new();
+    for ((name, _), walk) in OBJECTS.iter().zip(&walks) {
+        let told = sides::told(programs, walk, name, "fast")?;
+        println!("| {name} | fast | {} |", sides::cells(told));
+        all.push(told);
+    }
+    println!("| all | fast | {} |", sides::cells(sides::sum(&all)));
+    Ok(())
+}
+
 /// The table of videos.
 fn videos(programs: &Programs, seed: u64) -> Result<()> {
     println!("\nvideo, seed {seed}, made in {OUT}\n");
@@ -249,8 +272,8 @@ fn videos(programs: &Programs, seed: u64) -> Result<()> {
          searched all around | a frame, median |\n|---|---|---|---|---|---|---|---|---|"
     );
     let folder = Path::new(OUT).join("views-of-video");
-    programs
-        .rendered(&folder, &[("--cameras", "spiral"), ("--views", &video::VIEWS.to_string()), ("--focal", &FOCAL.to_string())])?;
+    let [views, focal] = [video::VIEWS.to_string(), FOCAL.to_string()];
+    programs.rendered(&folder, SIDE, &[("--cameras", "spiral"), ("--views", &views), ("--focal", &focal)])?;
     let mut random = Pcg64Mcg::seed_from_u64(seed);
     for object in 0..OBJECTS.len() {
         let video = Video::new(object, &folder, &mut random)?;
@@ -311,17 +334,17 @@ impl Programs {
         let mut flags =
             vec![("--cameras", "sphere"), ("--views", &*views), ("--radius", &radius), ("--focal", &focal), ("--seed", &seed)];
         flags.extend(is_rolled.then_some(("--roll", "")));
-        self.rendered(&folder, &flags)?;
+        self.rendered(&folder, SIDE, &flags)?;
         Ok(folder)
     }
 
     /// Renders all objects into a folder.
-    fn rendered(&self, folder: &Path, flags: &[(&str, &str)]) -> Result<()> {
+    fn rendered(&self, folder: &Path, side: u32, flags: &[(&str, &str)]) -> Result<()> {
         let mesh = |(name, file): (&str, &str)| {
             format!("{name}={}", if file.ends_with(".dat") { format!("{LDRAW}/{file}") } else { file.into() })
         };
         let mut render = self.command("sigma-data");
-        render.arg("render").args(OBJECTS.map(mesh)).args(["--side", &SIDE.to_string(), "--force", "--out"]).arg(folder);
+        render.arg("render").args(OBJECTS.map(mesh)).args(["--side", &side.to_string(), "--force", "--out"]).arg(folder);
         render.args(flags.iter().flat_map(|(flag, value)| [*flag, *value]).filter(|word| !word.is_empty()));
         let output = render.output()?;
         if output.status.success() { Ok(()) } else { Err(said(&output)) }
