@@ -182,7 +182,11 @@ fn training_learns_and_writes_what_a_person_wants_to_see() {
          --steps 300 --lr 5e-3 --warm-up 100 --decay-from 200 --decay 0.1 --log-every 50 --validate-every 150 --plain-srn --executor cpu --json",
         run.display()
     );
-    let result: Value = serde_json::from_str(&succeed(&fit)).unwrap();
+    let output = sigma_train(&fit);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    // So little training shows no object well.
+    assert!(["bucket (", "valve (", "train longer"].iter().all(|word| stderr(&output).contains(word)), "{}", stderr(&output));
+    let result: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!((&result["steps"], &result["views"]), (&300.into(), &"training".into()));
 
     let lines = metrics(&run);

@@ -17,6 +17,7 @@ use image::RgbImage;
 use indicatif::ProgressBar;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
+use sigma_srn::confidence::UNEXPLAINED;
 use sigma_srn::{Engine, Losses, Metadata, Model, Random, Renderer, Train, Trainer, stream, unexplained, write_atomically};
 use srn_data::{Dataset, SrnSet, pixels, sheet};
 
@@ -194,7 +195,16 @@ pub fn fit(args: &FitArgs) -> Result<bool> {
     }
 
     let mut trained = trainer.model()?.clone();
-    trained.metadata.unexplained = unexplained_at_truth(&engine, &trained, &set, validation.as_ref(), settings.side)?;
+    trained.metadata.unexplained =
+        unexplained_at_truth(&engine, &trained, &set, validation.as_ref(), settings.side, watched.len())?;
+    let is_much = |(_, part): &(&String, &f64)| **part > UNEXPLAINED;
+    let much: Vec<String> = (trained.metadata.unexplained.iter().filter(is_much))
+        .map(|(name, part)| format!("{name} ({:.0} %)", 100.0 * part))
+        .collect();
+    if !much.is_empty() {
+        let what = "much of the pictures is not explained by the model's views, so few poses will be trusted";
+        eprintln!("warning: {what}: {}; train longer, or go on from a trained model (--from)", much.join(", "));
+    }
     let model = run.join("model.safetensors");
     trained.save(&model)?;
     let curves = run.join("curves.png");
@@ -262,13 +272,14 @@ fn watched_views<'a>(set: &'a Dataset, validation: Option<&'a Dataset>, count: u
         .collect()
 }
 
-/// What true poses leave unexplained, see [`Metadata::unexplained`]: of the validation's pictures where there are any.
+/// What true poses leave unexplained, see [`Metadata::unexplained`]: of the validation's pictures where there are any, `at_once` of them at a time.
 fn unexplained_at_truth(
     engine: &Engine,
     model: &Model,
     set: &Dataset,
     validation: Option<&Dataset>,
     side: u32,
+    at_once: usize,
 ) -> Result<BTreeMap<String, f64>> {
     let mut all = BTreeMap::new();
     let instances = spread((0..set.instances.len()).collect(), LOOKED_AT);
@@ -278,11 +289,14 @@ fn unexplained_at_truth(
         let unseen = validation.iter().flat_map(|set| &set.instances).find(|other| other.name == instance.name);
         let views = spread(unseen.unwrap_or(instance).views.iter().collect(), LOOKED_AT);
         let views: Vec<Shown> = views.into_iter().map(|view| (number as u32, view)).collect();
-        let rendering = render(engine, model, &views, side)?;
-        let pictures = rendering.rgb.chunks(rendering.rgb.len() / views.len());
-        let parts = pictures.zip(&views).map(|(picture, (_, view))| unexplained(&view.rgb, None, picture));
+        let mut parts = Vec::new();
+        for views in views.chunks(at_once) {
+            let rendering = render(engine, model, views, side)?;
+            let pictures = rendering.rgb.chunks(rendering.rgb.len() / views.len());
+            parts.extend(pictures.zip(views).map(|(picture, (_, view))| unexplained(&view.rgb, None, picture)));
+        }
         // A white picture leaves nothing to explain.
-        let mut parts: Vec<f64> = parts.filter(|part| part.is_finite()).collect();
+        parts.retain(|part| part.is_finite());
         parts.sort_by(f64::total_cmp);
         // Masks and cameras of a tenth may be wrong.
         if let Some(&most) = parts.get((9 * parts.len() / 10).saturating_sub(1)) {

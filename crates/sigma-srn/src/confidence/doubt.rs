@@ -41,9 +41,11 @@ impl std::fmt::Display for Doubt {
     }
 }
 
-/// What a picture may leave unexplained where there is no calibration,
-const UNEXPLAINED: f64 = 0.25;
-/// and how many times what pictures of the object leave that the model has learnt from, or that its training has looked at (`docs/accuracy.md`).
+/// What a picture may leave unexplained where there is no calibration.
+pub const UNEXPLAINED: f64 = 0.25;
+/// What it may leave there in any case: as little tells no wrong pose from a mask that is not exact.
+const LEAST_UNEXPLAINED: f64 = 0.12;
+/// How many times that what pictures of the object leave that its training has looked at, see [`Metadata::unexplained`] (`docs/accuracy.md`).
 const ABOVE_LEARNT: f64 = 1.6;
 /// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on, or that is partly hidden (`docs/accuracy.md`).
 const RIVAL: f64 = 0.3;
@@ -82,7 +84,8 @@ impl Estimate {
             }
             None => {
                 let learnt = model.metadata.unexplained.get(&model.instance_name(instance));
-                unexplained_doubt(unexplained, learnt.map_or(UNEXPLAINED, |most| UNEXPLAINED.min(ABOVE_LEARNT * most)))
+                let most = learnt.map_or(UNEXPLAINED, |most| (ABOVE_LEARNT * most).max(LEAST_UNEXPLAINED).min(UNEXPLAINED));
+                unexplained_doubt(unexplained, most)
             }
         };
         self.doubt_besides(&model.metadata, picture)
@@ -313,6 +316,8 @@ mod tests {
             (&learnt(0.1), at(1.3), 0.15, None),
             (&learnt(0.1), at(1.3), 0.17, Some(Doubt::Unexplained)),
             (&learnt(0.2), at(1.3), 0.3, Some(Doubt::Unexplained)),
+            (&learnt(0.05), at(1.3), 0.11, None),
+            (&learnt(0.05), at(1.3), 0.13, Some(Doubt::Unexplained)),
             (&learnt(0.1), at(0.6), 0.15, Some(Doubt::Distance)),
         ] {
             assert_eq!(estimate.doubt(model, 0, part), doubt, "{part} {:?}", estimate.pose);
