@@ -84,7 +84,7 @@ impl Estimate {
             }
             None => {
                 let learnt = model.metadata.unexplained.get(&model.instance_name(instance));
-                let most = learnt.map_or(UNEXPLAINED, |most| (ABOVE_LEARNT * most).max(LEAST_UNEXPLAINED).min(UNEXPLAINED));
+                let most = learnt.map_or(UNEXPLAINED, |most| (ABOVE_LEARNT * most).clamp(LEAST_UNEXPLAINED, UNEXPLAINED));
                 unexplained_doubt(unexplained, most)
             }
         };
