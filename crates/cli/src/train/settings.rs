@@ -156,7 +156,7 @@ pub struct Changeable {
     /// Learning rate of Adam [2e-3, paper 5e-5].
     #[arg(long, value_name = "RATE", value_parser = positive)]
     lr: Option<f64>,
-    /// Steps over which the learning rate rises to it [100, paper 0].
+    /// Steps over which the learning rate rises to it [200, paper 0].
     #[arg(long, value_name = "STEPS")]
     warm_up: Option<u64>,
     /// Factor on the learning rate at the last step, towards which it falls evenly [0.005, paper 1].
@@ -219,7 +219,7 @@ impl Settings {
             detail: if is_paper { 0.0 } else { 0.5 },
             steps: if is_paper { 100_000 } else { 14_000 },
             lr: if is_paper { 5e-5 } else { 2e-3 },
-            warm_up: if is_paper { 0 } else { 100 },
+            warm_up: if is_paper { 0 } else { 200 },
             decay: if is_paper { 1.0 } else { 0.005 },
             decay_from: 0,
             seed: 0,
