@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::confidence::{self, Matrix6, fit, motion, unexplained};
+use sigma_srn::confidence::{self, Matrix6, UNEXPLAINED, fit, motion, unexplained};
 use sigma_srn::{Calibration, Effort, Found, Metadata, Options, Rendering, Seen, View};
 
 use super::files::Picture;
@@ -296,7 +296,12 @@ fn calibration(known: &[Known], lost: &[Known], at_truth: BTreeMap<String, f64>)
         Some(confidence::Known { instance: instance.clone(), motion: *motion, shape: (*shape)? })
     };
     let (curvature, floor, sizes) = fit(&found().filter_map(error).collect::<Vec<_>>())?;
-    let Limits { unexplained, above_truth, rival } = limits(known, lost);
+    let Limits { mut unexplained, above_truth, rival } = limits(known, lost);
+    // Few say no more of what wrong poses leave than a model without a calibration knows.
+    if found().count() < ENOUGH {
+        let most = found().map(|known| known.unexplained).fold(UNEXPLAINED, f64::max);
+        unexplained = unexplained.min(most);
+    }
     let median = |of: fn(&Seen) -> f64| {
         let mut values: Vec<f64> = found().map(|known| of(&known.seen)).collect();
         values.sort_by(f64::total_cmp);
@@ -413,6 +418,9 @@ mod tests {
         let found = calibration(&views, &[], BTreeMap::new()).unwrap();
         assert!((found.unexplained - 0.135).abs() < 1e-12 && found.rival == 0.0 && found.views == 9, "{found:?}");
         assert_eq!(calibration(&[known(90.0, 0.1, 1.0)], &[], BTreeMap::new()), None);
+        // But few views do not make them looser than those of a model that is not calibrated.
+        let all = |count: usize| calibration(&vec![known(1.0, 0.2, f64::INFINITY); count], &[], BTreeMap::new()).unwrap();
+        assert!((all(19).unexplained - 0.3).abs() < 1e-12 && all(18).unexplained == UNEXPLAINED);
     }
 
     #[test]
