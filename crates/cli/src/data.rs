@@ -8,12 +8,12 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use glam::{DMat4, DVec3};
 use serde::Deserialize;
+use sigma_srn::photo::MARGIN;
 use srn_data::camera::Axes;
 use srn_data::capture::{Bounds, Capture, Frame, FrameRecord, UpAxis};
 use srn_data::formats::{self, Format, ReadOptions, WriteOptions, Written, bop};
 use srn_data::inspect::{self, Origin};
 use srn_data::srn;
-use srn_data::target::MARGIN;
 
 use crate::common::{Result, axes, named, print, refuse_existing, refuse_to_write, write_picture};
 use crate::meshes;

@@ -18,7 +18,6 @@ pub mod obj;
 mod picture;
 pub mod pixels;
 pub mod ply;
-pub mod segment;
 pub mod sheet;
 pub mod srn;
 pub mod stl;

@@ -9,10 +9,11 @@
 use crate::camera::rigid_error;
 use crate::capture::FrameRecord;
 use crate::error::{At, Error, Result, read_text};
-use crate::pixels::{ENDINGS, Pixels, ends_like};
+use crate::pixels::{ENDINGS, ends_like, open};
 use glam::DMat4;
 use image::metadata::Orientation;
 use image::{ImageDecoder, RgbImage};
+use srn_photo::Pixels;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -202,7 +203,7 @@ pub fn is_turned(path: &Path) -> bool {
 /// point, the resampling scales all four by `side / height` (as SRN does; the half-pixel shift of pixel centres that remains at
 /// other sizes is the convention's, not corrected here).
 pub fn load_square(path: &Path, intrinsics: &Intrinsics, side: usize) -> Result<(Pixels, [f32; 4])> {
-    let image = Pixels::open(path)?;
+    let image = open(path)?;
     let in_file = intrinsics.of_picture(path, [image.width, image.height])?;
     let Intrinsics { focal: [fx, fy], centre: [cx, cy], .. } = in_file.of_square(side);
     Ok((image.centre_square().area_resample(side, side), [fx, fy, cx, cy].map(|x| x as f32)))

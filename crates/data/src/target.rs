@@ -1,130 +1,73 @@
-//! A photograph as a search for its pose takes it: a square, the object in it, and how much each pixel counts.
+//! A photograph in a file as a search for its pose takes it: a square, the object in it, and how much each pixel counts.
 
 use crate::error::{Error, Result};
 use crate::picture::read_mask;
-use crate::pixels::Pixels;
-use crate::segment::{BoundingBox, Known, object_in};
-use crate::srn::{Intrinsics, load_square};
+use crate::pixels::open_with_opacity;
+use crate::srn::Intrinsics;
+use srn_photo::{BoundingBox, Known, Photo, Pixels, Square};
 use std::path::Path;
-
-/// Room around the object on each side of a square that is cut around it, as a share of its extent.
-pub const MARGIN: f64 = 0.1;
 
 /// What of a photograph is the object.
 #[derive(Clone, Copy)]
 pub enum Cutout<'a> {
     /// By a mask, white or opaque where it is.
     Mask(&'a Path),
-    /// By a box around it, and by what is known of it; see [`crate::segment`].
+    /// By a box around it, and by what is known of it.
     Box(BoundingBox, Known<'a>),
 }
 
-/// A square of a picture, resampled.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Target {
-    /// Colours in [-1, 1], row-major `[side · side, 3]`; white where the picture is transparent.
-    pub rgb: Vec<f32>,
-    /// How much each pixel counts, 0 to 1, `[side · side]`; `None` where all do.
-    pub weights: Option<Vec<f32>>,
-    /// How much of each pixel is opaque, 0 to 1, `[side · side]`: of what counts, the rest is white. `None` where the picture was not cut.
-    pub coverage: Option<Vec<f32>>,
-    /// `fx, fy, cx, cy` in pixels of the square; integer coordinates are pixel centres.
-    pub intrinsics: [f32; 4],
-    /// Whether the square was cut around the object.
-    pub cut: bool,
-    /// The first pixel of the square in the picture, across and down; outside of it where the square reaches out.
-    pub corner: [i64; 2],
-    /// Width and height of the square in pixels of the picture.
-    pub extent: usize,
+/// Reads a picture that was cut before, as those of data sets are: its centre square (see [`crate::srn::load_square`]). Where the mask is
+/// black, pixels do not count.
+pub fn of_view(path: &Path, mask: Option<&Path>, intrinsics: &Intrinsics, side: usize) -> Result<Square> {
+    let (picture, opacity) = open_with_opacity(path)?;
+    let size = [picture.width, picture.height];
+    let mut photo = photo(path, picture, opacity)?;
+    if let Some(mask) = mask {
+        photo.mask(counts(mask, size)?);
+    }
+    Ok(photo.centre(whole(path, intrinsics, size)?, side))
 }
 
-impl Target {
-    /// Reads a picture that was cut before, as those of data sets are: its centre square (see [`load_square`]). Where the mask is
-    /// black, pixels do not count.
-    pub fn of_view(path: &Path, mask: Option<&Path>, intrinsics: &Intrinsics, side: usize) -> Result<Self> {
-        let size = crate::srn::picture_size(path)?;
-        let extent = size[0].min(size[1]);
-        let corner = size.map(|s| ((s - extent) / 2) as i64);
-        let Some(mask) = mask else {
-            let (pixels, intrinsics) = load_square(path, intrinsics, side)?;
-            return Ok(Self { rgb: pixels.data, weights: None, coverage: None, intrinsics, cut: false, corner, extent });
-        };
-        let (picture, counts) = (Pixels::open(path)?, counts(mask, size)?);
-        let Intrinsics { focal: [fx, fy], centre: [cx, cy], .. } = intrinsics.of_picture(path, size)?.of_square(side);
-        let (rgb, weights) = weighted(&picture, &counts, corner, extent, side);
-        let intrinsics = [fx, fy, cx, cy].map(|x| x as f32);
-        Ok(Self { rgb, weights: Some(weights), coverage: None, intrinsics, cut: false, corner, extent })
+/// Reads a photograph and cuts a square around what masks and transparency leave of it (see [`Photo::square`]); the intrinsics follow.
+/// Pixels where the mask is black, or outside of the photograph, do not count; what the cutout leaves out is white background, as what is
+/// transparent is, and does. Without any of these it is the centre square.
+pub fn of_photo(
+    path: &Path,
+    cutout: Option<Cutout>,
+    mask: Option<&Path>,
+    intrinsics: &Intrinsics,
+    side: usize,
+) -> Result<Square> {
+    let (picture, opacity) = open_with_opacity(path)?;
+    let size = [picture.width, picture.height];
+    let mut photo = photo(path, picture, opacity)?;
+    match cutout {
+        None => {}
+        Some(Cutout::Mask(mask)) => photo.cut_out(&counts(mask, size)?),
+        Some(Cutout::Box(bounds, known)) => photo.cut_out_of(bounds, known).ok_or_else(|| nothing_in(path, bounds, size))?,
     }
+    if let Some(mask) = mask {
+        photo.mask(counts(mask, size)?);
+    }
+    photo.square(whole(path, intrinsics, size)?, side).ok_or_else(|| {
+        Error::field(
+            mask.or(if let Some(Cutout::Mask(mask)) = cutout { Some(mask) } else { None }).unwrap_or(path),
+            "mask",
+            "white, or opaque, where the object is",
+            format!("nothing of it, at most {:.0} of 255", 255.0 * photo.most_shown()),
+        )
+    })
+}
 
-    /// Reads a photograph and cuts a square around what masks and transparency leave of it, with [`MARGIN`]; the intrinsics follow.
-    /// Pixels where the mask is black, or outside of the photograph, do not count; what the cutout leaves out is white background, as what is
-    /// transparent is, and does. Without any of these it is the centre square.
-    pub fn of_photo(
-        path: &Path,
-        cutout: Option<Cutout>,
-        mask: Option<&Path>,
-        intrinsics: &Intrinsics,
-        side: usize,
-    ) -> Result<Self> {
-        let (mut picture, mut opacity) = Pixels::open_with_opacity(path)?;
-        let size = [picture.width, picture.height];
-        let object = match cutout {
-            None => None,
-            Some(Cutout::Mask(mask)) => Some(counts(mask, size)?),
-            Some(Cutout::Box(bounds, known)) => {
-                Some(object_in(&picture, bounds, known).ok_or_else(|| nothing_in(path, bounds, size))?)
-            }
-        };
-        if let Some(object) = object {
-            for ((colours, opacity), object) in picture.data.chunks_exact_mut(3).zip(&mut opacity).zip(object) {
-                colours.iter_mut().for_each(|colour| *colour = object * *colour + (1.0 - object));
-                *opacity *= object;
-            }
-        }
-        let counts = mask.map(|mask| counts(mask, size)).transpose()?;
-        let shown = |i: usize| opacity[i].min(counts.as_ref().map_or(1.0, |counts| counts[i]));
-        let points = (0..opacity.len()).filter(|&i| shown(i) > 0.5).map(|i| [i % size[0], i / size[0]]);
-        let bounds = points.clone().fold(None, |bounds: Option<[[usize; 2]; 2]>, p| {
-            let [low, high] = bounds.unwrap_or([p; 2]);
-            Some([[0, 1].map(|k| low[k].min(p[k])), [0, 1].map(|k| high[k].max(p[k]))])
-        });
-        let Some([low, high]) = bounds else {
-            return Err(Error::field(
-                mask.or(if let Some(Cutout::Mask(mask)) = cutout { Some(mask) } else { None }).unwrap_or(path),
-                "mask",
-                "white, or opaque, where the object is",
-                format!("nothing of it, at most {:.0} of 255", 255.0 * (0..opacity.len()).map(shown).fold(0.0, f32::max)),
-            ));
-        };
-        if points.count() == opacity.len() {
-            return Self::of_view(path, None, intrinsics, side);
-        }
-        // Where the object reaches the edge of the photograph, what lies beyond is not white but unknown.
-        let is_cut_off = [0, 1].into_iter().any(|k| low[k] == 0 || high[k] + 1 == size[k]);
-        let counts = counts.or_else(|| is_cut_off.then(|| vec![1.0; size[0] * size[1]]));
-        let across = [0, 1].map(|k| high[k] - low[k] + 1);
-        let extent = (across[0].max(across[1]) as f64 * (1.0 + 2.0 * MARGIN)).ceil() as usize;
-        let corner = [0, 1].map(|k| (low[k] + high[k] + 1) as i64 / 2 - extent as i64 / 2);
-        let intrinsics = intrinsics.of_picture(path, size)?;
-        let scale = side as f64 / extent as f64;
-        let [fx, fy] = intrinsics.focal.map(|focal| focal * scale);
-        // Edges of pixels are whole numbers half a pixel before the centres.
-        let [cx, cy] = [0, 1].map(|k| (intrinsics.centre[k] + 0.5 - corner[k] as f64) * scale - 0.5);
-        let intrinsics = [fx, fy, cx, cy].map(|x| x as f32);
-        let opaque = Pixels { data: opacity.iter().flat_map(|&share| [share; 3]).collect(), ..picture };
-        let (rgb, opaque, weights) = match counts {
-            Some(counts) => {
-                let (rgb, weights) = weighted(&picture, &counts, corner, extent, side);
-                (rgb, weighted(&opaque, &counts, corner, extent, side).0, Some(weights))
-            }
-            None => {
-                let cut = |of: &Pixels, outside| of.square(corner, extent, outside).area_resample(side, side).data;
-                (cut(&picture, 1.0), cut(&opaque, 0.0), None)
-            }
-        };
-        let coverage = Some(opaque.into_iter().step_by(3).map(|share| share.clamp(0.0, 1.0)).collect());
-        Ok(Self { rgb, weights, coverage, intrinsics, cut: true, corner, extent })
-    }
+fn photo(path: &Path, picture: Pixels, opacity: Vec<f32>) -> Result<Photo> {
+    let found = format!("{}×{}", picture.width, picture.height);
+    Photo::new(picture, opacity).ok_or_else(|| Error::field(path, "size", "pixels", found))
+}
+
+/// `fx, fy, cx, cy` of a picture of this size.
+fn whole(path: &Path, intrinsics: &Intrinsics, size: [usize; 2]) -> Result<[f64; 4]> {
+    let Intrinsics { focal: [fx, fy], centre: [cx, cy], .. } = intrinsics.of_picture(path, size)?;
+    Ok([fx, fy, cx, cy])
 }
 
 /// Of a box in which no object is seen.
@@ -146,21 +89,10 @@ fn counts(mask: &Path, size: [usize; 2]) -> Result<Vec<f32>> {
     Ok(read_mask(mask, size.map(|s| s as u32))?.into_iter().map(|m| f32::from(m) / 255.0).collect())
 }
 
-/// Colours and weights of a square: a pixel's weight is the share of its area that counts, its colour the mean of that share, so
-/// that nothing of what is masked out bleeds in.
-fn weighted(picture: &Pixels, counts: &[f32], corner: [i64; 2], extent: usize, side: usize) -> (Vec<f32>, Vec<f32>) {
-    let square = |data: Vec<f32>| Pixels { data, ..*picture }.square(corner, extent, 0.0).area_resample(side, side);
-    let weights = square(counts.iter().flat_map(|&w| [w; 3]).collect()).data;
-    let times = |(colour, weight): (&[f32], &f32)| [0, 1, 2].map(|c| colour[c] * weight);
-    let colours = square(picture.data.chunks_exact(3).zip(counts).flat_map(times).collect()).data;
-    let mean = |(sum, weight): (f32, &f32)| if *weight > 0.0 { (sum / weight).clamp(-1.0, 1.0) } else { 1.0 };
-    let rgb = colours.into_iter().zip(&weights).map(mean).collect();
-    (rgb, weights.into_iter().step_by(3).collect())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::srn::load_square;
     use image::{GrayImage, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 
     const INTRINSICS: Intrinsics = Intrinsics { focal: [60.0, 60.0], centre: [30.0, 20.0], size: [60, 40] };
@@ -187,7 +119,7 @@ mod tests {
         let object = |x: u32, y: u32| (41..51).contains(&x) && (6..12).contains(&y);
         let mask = GrayImage::from_fn(60, 40, |x, y| Luma([if object(x, y) { 255 } else { 0 }]));
         let mask = saved(dir.path(), "mask.png", mask);
-        let target = Target::of_photo(&photo, None, Some(&mask), &INTRINSICS, 6).unwrap();
+        let target = of_photo(&photo, None, Some(&mask), &INTRINSICS, 6).unwrap();
         // 10 pixels and a tenth on each side: 12, two for each of the square's; rows 3 to 14.
         assert_eq!((target.corner, target.extent), ([40, 3], 12));
         let weights = target.weights.unwrap();
@@ -211,17 +143,17 @@ mod tests {
             Rgba([r, g, b, if object(x, y) { 255 } else { 0 }])
         });
         let cut = saved(dir.path(), "cut.png", cut);
-        let alone = Target::of_photo(&cut, None, None, &INTRINSICS, 6).unwrap();
+        let alone = of_photo(&cut, None, None, &INTRINSICS, 6).unwrap();
         assert_eq!((alone.corner, alone.extent, alone.weights.is_none()), ([40, 3], 12, true));
         assert_eq!((&alone.rgb[..3], &alone.rgb[3 * 13..][..3]), (&[1.0; 3][..], &[-1.0, -1.0, 1.0][..]));
         let coverage = alone.coverage.as_ref().unwrap();
         assert_eq!((&coverage[..6], &coverage[12..18]), (&[0.0; 6][..], &[0.5, 1.0, 1.0, 1.0, 1.0, 0.5][..]));
         // A mask that cuts out is as good, and goes together with transparency.
-        assert_eq!(Target::of_photo(&photo, Some(Cutout::Mask(&mask)), None, &INTRINSICS, 6).unwrap(), alone);
-        assert_eq!(Target::of_photo(&cut, Some(Cutout::Mask(&mask)), None, &INTRINSICS, 6).unwrap(), alone);
+        assert_eq!(of_photo(&photo, Some(Cutout::Mask(&mask)), None, &INTRINSICS, 6).unwrap(), alone);
+        assert_eq!(of_photo(&cut, Some(Cutout::Mask(&mask)), None, &INTRINSICS, 6).unwrap(), alone);
         let left = GrayImage::from_fn(60, 40, |x, _| Luma([if x < 46 { 255 } else { 0 }]));
         let left = saved(dir.path(), "left.png", left);
-        let both = Target::of_photo(&cut, None, Some(&left), &INTRINSICS, 6).unwrap();
+        let both = of_photo(&cut, None, Some(&left), &INTRINSICS, 6).unwrap();
         assert_eq!((both.corner, both.extent), ([39, 5], 8));
         // 7 of its 8 columns are in the mask; the last of the square's takes in the last one and a third.
         assert_eq!(both.weights.unwrap()[..6], [1.0, 1.0, 1.0, 1.0, 1.0, 0.25]);
@@ -234,7 +166,7 @@ mod tests {
         let cut = |from: u32, to: u32| {
             let alpha = |x: u32, y: u32| if (from..to).contains(&x) && (10..20).contains(&y) { 255 } else { 0 };
             let path = saved(dir.path(), "cut.png", RgbaImage::from_fn(60, 40, |x, y| Rgba([255, 0, 0, alpha(x, y)])));
-            Target::of_photo(&path, None, None, &INTRINSICS, 12).unwrap()
+            of_photo(&path, None, None, &INTRINSICS, 12).unwrap()
         };
         // 10 pixels and one on each side; the last column is one beyond the edge.
         let target = cut(50, 60);
@@ -251,7 +183,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let photo = saved(dir.path(), "photo.png", RgbImage::from_pixel(60, 40, Rgb([255, 0, 0])));
         let mask = saved(dir.path(), "mask.png", GrayImage::from_fn(60, 40, |x, _| Luma([if x < 20 { 255 } else { 0 }])));
-        let target = Target::of_photo(&photo, None, Some(&mask), &INTRINSICS, 12).unwrap();
+        let target = of_photo(&photo, None, Some(&mask), &INTRINSICS, 12).unwrap();
         assert_eq!((target.corner, target.extent), ([-14, -4], 48));
         let weights = target.weights.unwrap();
         // Of the square's row, 14 pixels lie outside, 20 in the mask: 3.5 and 5 of its own.
@@ -265,12 +197,12 @@ mod tests {
         let picture = RgbImage::from_fn(60, 40, |x, y| Rgb(colour(x, y)));
         let path = saved(dir.path(), "view.png", picture);
         let (pixels, intrinsics) = load_square(&path, &INTRINSICS, 8).unwrap();
-        let plain = Target::of_view(&path, None, &INTRINSICS, 8).unwrap();
+        let plain = of_view(&path, None, &INTRINSICS, 8).unwrap();
         assert_eq!((&plain.rgb, plain.intrinsics, plain.weights, plain.coverage), (&pixels.data, intrinsics, None, None));
         assert_eq!((plain.corner, plain.extent), ([10, 0], 40));
-        assert_eq!(Target::of_photo(&path, None, None, &INTRINSICS, 8).unwrap().rgb, pixels.data);
+        assert_eq!(of_photo(&path, None, None, &INTRINSICS, 8).unwrap().rgb, pixels.data);
         let top = saved(dir.path(), "top.png", GrayImage::from_fn(60, 40, |_, y| Luma([if y < 20 { 255 } else { 0 }])));
-        let masked = Target::of_view(&path, Some(&top), &INTRINSICS, 8).unwrap();
+        let masked = of_view(&path, Some(&top), &INTRINSICS, 8).unwrap();
         assert_eq!(masked.intrinsics, intrinsics);
         assert_eq!(masked.weights.unwrap(), [[1.0; 32], [0.0; 32]].concat());
         assert!(masked.rgb[..96].iter().zip(&pixels.data).all(|(a, b)| (a - b).abs() < 1e-6));
@@ -296,7 +228,7 @@ mod tests {
         let photo = saved(dir.path(), "photo.png", RgbImage::new(60, 40));
         let small = saved(dir.path(), "small.png", GrayImage::new(6, 4));
         let black = saved(dir.path(), "black.png", GrayImage::new(60, 40));
-        let error = |mask: &Path| Target::of_photo(&photo, None, Some(mask), &INTRINSICS, 6).unwrap_err().to_string();
+        let error = |mask: &Path| of_photo(&photo, None, Some(mask), &INTRINSICS, 6).unwrap_err().to_string();
         let (wrong, nothing) = (error(&small), error(&black));
         assert!(wrong.contains("small.png") && wrong.contains("60×40") && wrong.contains("6×4"), "{wrong}");
         assert!(nothing.contains("black.png") && nothing.contains("nothing"), "{nothing}");

@@ -16,6 +16,7 @@ mod light;
 mod mask;
 mod model;
 mod network;
+pub mod photo;
 mod random;
 mod rays;
 mod region;

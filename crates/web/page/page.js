@@ -1,24 +1,33 @@
 // The page: chooses pictures and cameras, and draws what the library computes.
 import init, { Session } from "./sigma_web.js";
 
-/// Pixels to a side of all pictures.
-const SIDE = 64;
+/// Most pixels of a photograph to a side.
+const LARGEST = 1024;
 const at = (id) => document.getElementById(id);
 
 let session;
+/// Pixels to a side of what is compared.
+let side = 64;
 let samples = [];
 /// The sample shown, if it is one; its pose is known.
 let sample;
-/// RGBA of the picture, transparent where it was.
+/// The photograph: a canvas, transparent where it was.
+let photo;
+/// A box around the object in it, if one is drawn: left edge, top edge, width, height.
+let box;
+/// RGBA of the square of it that is compared.
 let picture;
-/// The camera of the view: 4 × 4, row by row, world_from_camera.
+/// The camera of the view: 4 × 4, row by row, world_from_camera; and its fx, fy, cx, cy, if they are not those of the field of view.
 let camera;
+let lens;
 /// The library does one thing at a time.
 let busy = false;
 /// A view is wanted as soon as it can be had.
 let stale = false;
 
-const focal = () => SIDE / 2 / Math.tan((Number(at("fov").value) * Math.PI) / 360);
+/// Of a picture with so many pixels to a row.
+const focal = (width) => width / 2 / Math.tan((Number(at("fov").value) * Math.PI) / 360);
+const plain = () => [focal(side), focal(side), side / 2, side / 2];
 const instance = () => at("object").selectedIndex;
 
 function say(text, kind = "") {
@@ -40,13 +49,13 @@ async function alone(work) {
   } finally {
     busy = false;
     at("executor").disabled = false;
-    at("search").disabled = !picture;
+    at("search").disabled = !photo;
   }
   if (stale) look();
 }
 
 function draw(id, rgba) {
-  at(id).getContext("2d").putImageData(new ImageData(new Uint8ClampedArray(rgba), SIDE, SIDE), 0, 0);
+  at(id).getContext("2d").putImageData(new ImageData(new Uint8ClampedArray(rgba), side, side), 0, 0);
 }
 
 function show(view) {
@@ -63,7 +72,7 @@ function look() {
   stale = true;
   return alone(async () => {
     stale = false;
-    show(await session.render(instance(), camera, SIDE, focal()));
+    show(await session.render(instance(), camera, new Float64Array(lens ?? plain())));
   });
 }
 
@@ -90,26 +99,62 @@ function apart(a, b) {
   return [angle, Math.hypot(a[3] - b[3], a[7] - b[7], a[11] - b[11])];
 }
 
-/// Takes the middle square of an image for the picture.
+/// Takes an image for the photograph.
 async function choose(source, known) {
   const image = await createImageBitmap(source);
-  const square = Math.min(image.width, image.height);
-  const context = at("picture").getContext("2d", { willReadFrequently: true });
-  context.clearRect(0, 0, SIDE, SIDE);
+  const scale = Math.min(1, LARGEST / Math.max(image.width, image.height));
+  photo = new OffscreenCanvas(Math.round(scale * image.width), Math.round(scale * image.height));
+  const context = photo.getContext("2d", { willReadFrequently: true });
   context.imageSmoothingQuality = "high";
-  context.drawImage(image, (image.width - square) / 2, (image.height - square) / 2, square, square, 0, 0, SIDE, SIDE);
-  picture = context.getImageData(0, 0, SIDE, SIDE).data;
+  context.drawImage(image, 0, 0, photo.width, photo.height);
   sample = known;
+  box = known?.box;
   if (known) {
     at("object").value = known.object;
-    at("fov").value = known.fov.toFixed(1);
+    at("fov").value = known.fov.toFixed(2);
   }
   for (const thumbnail of at("samples").children) thumbnail.classList.toggle("chosen", thumbnail.dataset.image === known?.image);
   at("found").textContent = at("pose").textContent = "";
   at("progress").value = 0;
   say(known?.image ?? source.name);
   at("search").disabled = busy || !session;
+  compare();
   await look();
+}
+
+/// Shows the photograph, and takes its middle square for what is compared, until a search has found a better one.
+function compare() {
+  lens = undefined;
+  const square = Math.min(photo.width, photo.height);
+  const canvas = new OffscreenCanvas(side, side);
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.imageSmoothingQuality = "high";
+  context.drawImage(photo, (photo.width - square) / 2, (photo.height - square) / 2, square, square, 0, 0, side, side);
+  picture = context.getImageData(0, 0, side, side).data;
+  draw("picture", picture);
+  mark();
+}
+
+/// Draws the photograph with the box, and with the outline of what was found: `object` has a 1 for each pixel of it.
+function mark(object) {
+  const canvas = at("photo");
+  [canvas.width, canvas.height] = [photo.width, photo.height];
+  const context = canvas.getContext("2d");
+  context.drawImage(photo, 0, 0);
+  const thick = Math.max(1, canvas.width / 160);
+  context.fillStyle = context.strokeStyle = "#0c4";
+  for (let i = 0; object && i < object.length; i++) {
+    const x = i % canvas.width;
+    const isEdge = (x > 0 && object[i] !== object[i - 1]) || (i >= canvas.width && object[i] !== object[i - canvas.width]);
+    if (isEdge) context.fillRect(x - thick / 2, Math.floor(i / canvas.width) - thick / 2, thick, thick);
+  }
+  if (!box) return;
+  context.strokeStyle = "#fff";
+  context.lineWidth = 2 * thick;
+  context.strokeRect(...box);
+  context.strokeStyle = "#06c";
+  context.lineWidth = thick;
+  context.strokeRect(...box);
 }
 
 async function chooseSample(known) {
@@ -129,8 +174,14 @@ async function search(rough) {
     };
     // Before the first search on a GPU it is compared with the CPU.
     say("measuring kernels, comparing with the CPU");
-    found = await session.estimate(instance(), new Uint8Array(picture), SIDE, focal(), rough, at("fast").checked, observe);
-    camera = found.world_from_camera;
+    const { width, height } = photo;
+    const pixels = photo.getContext("2d").getImageData(0, 0, width, height).data;
+    const bounds = box && new Float64Array(box);
+    const rgba = new Uint8Array(pixels.buffer);
+    found = await session.estimate(instance(), rgba, width, focal(width), bounds, rough, at("fast").checked, observe);
+    [camera, lens, picture] = [found.world_from_camera, found.intrinsics, found.picture];
+    draw("picture", picture);
+    mark(found.object);
     show(found.view);
     at("progress").value = at("progress").max;
     say(`${((performance.now() - began) / 1000).toFixed(1)} s on ${session.executor()}`);
@@ -160,10 +211,42 @@ async function open() {
     console.warn(error);
     why = "no WebGPU here (the console says why)";
   }
+  side = session.side();
+  for (const id of ["picture", "view", "difference"]) at(id).width = at(id).height = side;
   at("object").replaceChildren(...session.instances().map((name) => new Option(name)));
   if (object) at("object").value = object;
   camera ??= orbit(0.6, 0.5, session.distance());
   at("where").textContent = why;
+}
+
+/// Dragging on the photograph draws a box; a click takes it away.
+function dragBox() {
+  let from;
+  const canvas = at("photo");
+  const place = (event) => {
+    const { left, top, width, height } = canvas.getBoundingClientRect();
+    const within = (value, most) => Math.min(most, Math.max(0, value));
+    const x = within(((event.clientX - left) / width) * canvas.width, canvas.width);
+    return [x, within(((event.clientY - top) / height) * canvas.height, canvas.height)];
+  };
+  canvas.addEventListener("pointerdown", (event) => {
+    if (!photo || busy) return;
+    from = place(event);
+    canvas.setPointerCapture(event.pointerId);
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    if (!from) return;
+    const to = place(event);
+    box = [0, 1].map((k) => Math.min(from[k], to[k])).concat([0, 1].map((k) => Math.abs(to[k] - from[k])));
+    mark();
+  });
+  canvas.addEventListener("pointerup", () => {
+    if (!from) return;
+    from = undefined;
+    if (box && Math.min(box[2], box[3]) < 4) box = undefined;
+    compare();
+    look();
+  });
 }
 
 /// Dragging turns the camera about the object.
@@ -179,6 +262,8 @@ function drag() {
     const most = Math.PI / 2 - 0.01;
     const up = Math.min(most, Math.max(-most, elevation + (event.clientY - y) / 100));
     camera = orbit(azimuth - (event.clientX - x) / 100, up, distance);
+    // Where the object was found in the photograph, it is not looked at in the middle.
+    lens = undefined;
     look();
   });
   at("view").addEventListener("pointerup", () => (from = undefined));
@@ -197,7 +282,7 @@ async function main() {
     at("samples").append(thumbnail);
   }
   at("object").addEventListener("change", look);
-  at("fov").addEventListener("change", look);
+  at("fov").addEventListener("change", () => ((lens = undefined), look()));
   at("file").addEventListener("change", () => {
     const [file] = at("file").files;
     if (file) choose(file).catch((error) => say(`${file.name}: ${error.message}`, "error"));
@@ -207,23 +292,26 @@ async function main() {
     const around = document.querySelector("input[name=starts]:checked").value === "around";
     search(around ? undefined : camera);
   });
+  dragBox();
   drag();
   say("choose a picture");
   await (samples.length ? chooseSample(samples[0]) : look());
 }
 
-/// For `cargo xtask web --check`: a search from 30° beside each sample's pose, told to whoever serves the page.
+/// For `cargo xtask web --check`: searches that begin with the side that each of these samples shows, told to whoever serves the page.
 async function check() {
   const lines = [];
   at("fast").checked = true;
   for (const executor of ["cpu", "gpu"]) {
     at("executor").value = executor;
     await open();
-    await chooseSample(samples[0]);
-    const found = await search(samples[0].pose);
-    const [angle, distance] = apart(found.world_from_camera, samples[0].pose);
-    const seconds = at("status").textContent.split(" s on ")[0];
-    lines.push(`${angle.toFixed(3)}°, ${distance.toFixed(4)} off, ${found.doubt ?? "trusted"}: ${samples[0].image} on ${session.executor()}, ${seconds} s`);
+    for (const sample of [samples.find((sample) => !sample.box), samples.find((sample) => sample.box)]) {
+      await chooseSample(sample);
+      const found = await search(sample.pose);
+      const [angle, distance] = apart(found.world_from_camera, sample.pose);
+      const seconds = at("status").textContent.split(" s on ")[0];
+      lines.push(`${angle.toFixed(3)}°, ${distance.toFixed(4)} off, ${found.doubt ?? "trusted"}: ${sample.image} on ${session.executor()}, ${seconds} s`);
+    }
   }
   return lines.join("\n");
 }

@@ -13,7 +13,8 @@ use glam::DMat4;
 use js_sys::futures::jspi_block_on_promise;
 use js_sys::{Function, Promise};
 use sigma_srn::camera::{around2016, neighbor4};
-use sigma_srn::{Effort, Engine, Gpu, Intrinsics, Model, Options, Outline, Query, Renderer, Search, wgpu};
+use sigma_srn::photo::{BoundingBox, FoundObject, Photo, Shot};
+use sigma_srn::{Effort, Engine, Gpu, Intrinsics, Model, Options, Progress, Renderer, Search, wgpu};
 use wasm_bindgen::prelude::*;
 
 /// A model on an executor.
@@ -21,7 +22,7 @@ use wasm_bindgen::prelude::*;
 pub struct Session {
     engine: Engine,
     model: Model,
-    renderer: Option<(u32, Renderer)>,
+    renderer: Option<Renderer>,
 }
 
 #[wasm_bindgen]
@@ -48,52 +49,58 @@ impl Session {
         self.model.metadata.orbit_radius.unwrap_or(1.3)
     }
 
-    /// A picture of `side` × `side` pixels, RGBA, from `world_from_camera` (4 × 4, row by row), with the focal length `focal` in pixels.
-    #[wasm_bindgen(jspi)]
-    pub fn render(&mut self, instance: u32, world_from_camera: &[f64], side: u32, focal: f64) -> Result<Vec<u8>, JsError> {
-        let camera = (pose(world_from_camera)?, intrinsics(side, focal)?);
-        Ok(to_rgba(&self.view(instance, camera, side)?))
+    /// Pixels to a side of the pictures that are compared.
+    pub fn side(&self) -> u32 {
+        self.model.metadata.side.unwrap_or(64)
     }
 
-    /// The pose of an object in a picture of `side` × `side` RGBA pixels, white or transparent where it is not, with the focal length `focal` in pixels.
-    /// Light and outline of a cut out object, that is where anything is transparent, are made up for.
-    /// `rough`: where the camera is within some 30° (4 × 4, row by row); if there is none, it is looked for all around.
+    /// A picture of [`Session::side`] × [`Session::side`] pixels, RGBA, from `world_from_camera` (4 × 4, row by row), with the intrinsics `fx, fy, cx, cy` in its pixels.
+    #[wasm_bindgen(jspi)]
+    pub fn render(&mut self, instance: u32, world_from_camera: &[f64], intrinsics: &[f64]) -> Result<Vec<u8>, JsError> {
+        let &[fx, fy, cx, cy] = intrinsics else { return Err(JsError::new("intrinsics are four numbers")) };
+        let camera = (pose(world_from_camera)?, Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 });
+        let side = self.side();
+        let renderer = match &mut self.renderer {
+            Some(renderer) => renderer,
+            none => none.insert(Renderer::new(&self.engine, &self.model, 1, side, side)?),
+        };
+        Ok(to_rgba(&renderer.render(&[instance], &[camera], 0)?.rgb))
+    }
+
+    /// The pose of an object in a photograph of RGBA pixels, `width` to a row, with the focal length `focal` in pixels and the principal point in its middle.
+    /// `bounds`: a box around the object (left edge, top edge, width and height in pixels), which is found in there. Without one the object is before white, in the middle square, or before
+    /// nothing: where anything is transparent, the square is cut around what is not. Light and outline of what is cut out, by either, are made up for.
+    /// `rough`: where the camera is within some 30° (4 × 4, row by row); of what is cut out it says from which side the object is seen. If there is none, it is looked for all around.
     /// `observe` is called with steps done, steps in all, and the best loss so far; a promise that it gives is waited for.
     #[wasm_bindgen(jspi)]
     pub fn estimate(
         &mut self,
         instance: u32,
         rgba: &[u8],
-        side: u32,
+        width: u32,
         focal: f64,
+        bounds: Option<Vec<f64>>,
         rough: Option<Vec<f64>>,
         is_fast: bool,
         observe: &Function,
     ) -> Result<Found, JsError> {
-        let intrinsics = intrinsics(side, focal)?;
-        let coverage: Vec<f32> = rgba.chunks_exact(4).map(|pixel| f32::from(pixel[3]) / 255.0).collect();
-        // On white.
-        let colour = |value: u8, covered: f32| 1.0 - covered * (2.0 - f32::from(value) / 127.5);
-        let pixels = rgba.chunks_exact(4).zip(&coverage);
-        let rgb = pixels.flat_map(|(pixel, &covered)| [0, 1, 2].map(|k| colour(pixel[k], covered))).collect();
-        let starts = match rough {
-            Some(rough) => neighbor4(&pose(&rough)?),
-            None => around2016(self.distance()),
-        };
-        let query = Query {
-            instance,
-            rgb,
-            weights: None,
-            coverage: coverage.iter().any(|&covered| covered < 1.0).then_some(coverage),
-            outline: Outline::AS_GIVEN,
-            width: side,
-            height: side,
-            intrinsics,
-            starts,
+        let height = rgba.len() / 4 / (width as usize).max(1);
+        let photo = Photo::from_rgba8(width as usize, height, rgba).ok_or(JsError::new("rows of RGBA pixels are expected"))?;
+        if !(f64::MIN_POSITIVE..f64::INFINITY).contains(&focal) {
+            return Err(JsError::new(&format!("a focal length of {focal} pixels")));
+        }
+        let middle = [width as usize, height].map(|pixels| pixels as f64 / 2.0);
+        let intrinsics = Intrinsics { fx: focal, fy: focal, cx: middle[0], cy: middle[1], pixel_center: 0.0 };
+        let rough = rough.as_deref().map(pose).transpose()?;
+        let model = &self.model;
+        let starts = |shot: &Shot| match &rough {
+            Some(rough) if shot.distance.is_some() => Ok(neighbor4(&shot.facing(model, rough)?)),
+            Some(rough) => Ok(neighbor4(rough)),
+            None => shot.around(model, around2016, None),
         };
         // No exhaustive one after it: the page shows the doubt, and who looks at it decides.
         let search = Search::from(Options::of(if is_fast { Effort::Fast } else { Effort::Normal }));
-        let found = search.run(&self.engine, &self.model, &[query], |progress| {
+        let observe = |progress: Progress| {
             let losses = progress.descent.losses()?;
             let best = losses.into_iter().fold(f64::INFINITY, f64::min);
             let answer = observe.call3(&JsValue::NULL, &progress.step.into(), &progress.steps.into(), &best.into());
@@ -102,27 +109,33 @@ impl Session {
                 drop(jspi_block_on_promise(&promise));
             }
             Ok(())
-        })?;
-        let found = &found[0];
+        };
+        let (shot, found) = match bounds.as_deref() {
+            Some(&[x, y, width, height]) => {
+                let bounds = BoundingBox { corner: [x, y], size: [width, height] };
+                search.run_in_box(&self.engine, model, instance, (&photo, &intrinsics), bounds, starts, observe)?
+            }
+            Some(_) => return Err(JsError::new("a box has four numbers")),
+            None => {
+                let square = photo.square([focal, focal, middle[0], middle[1]], self.side() as usize);
+                let shot = Shot::of(square.ok_or(JsError::new("all of the picture is transparent"))?, instance);
+                let found = search.run(&self.engine, model, &[shot.query(starts(&shot)?)], observe)?.remove(0);
+                (shot, found)
+            }
+        };
+        let object = FoundObject::of(&shot, &found.world_from_camera, &self.engine, model, 1)?;
+        let covers = |i: usize| object.covers([i % width as usize, i / width as usize].map(|x| x as f64 + 0.5));
+        let Intrinsics { fx, fy, cx, cy, .. } = shot.intrinsics;
         Ok(Found {
             world_from_camera: found.world_from_camera.transpose().to_cols_array().to_vec(),
             doubt: found.doubt.map(|doubt| doubt.to_string()),
             rotation_deg: found.confidence.map(|confidence| confidence.rotation_deg),
             translation: found.confidence.map(|confidence| confidence.translation),
+            picture: to_rgba(&shot.rgb),
             view: to_rgba(&found.view),
+            intrinsics: vec![fx, fy, cx, cy],
+            object: (0..rgba.len() / 4).map(|i| u8::from(covers(i))).collect(),
         })
-    }
-}
-
-impl Session {
-    /// The model's view `[side, side, 3]`.
-    fn view(&mut self, instance: u32, camera: (DMat4, Intrinsics), side: u32) -> Result<Vec<f32>, sigma_srn::Error> {
-        let renderer = match self.renderer.take().filter(|(known, _)| *known == side) {
-            Some((_, renderer)) => renderer,
-            None => Renderer::new(&self.engine, &self.model, 1, side, side)?,
-        };
-        let (_, renderer) = self.renderer.insert((side, renderer));
-        Ok(renderer.render(&[instance], &[camera], 0)?.rgb)
     }
 }
 
@@ -137,8 +150,14 @@ pub struct Found {
     pub rotation_deg: Option<f64>,
     /// Standard deviation of the camera's place, object units.
     pub translation: Option<f64>,
+    /// The square of the photograph that was compared, RGBA on white.
+    pub picture: Vec<u8>,
     /// The model's view from there, RGBA.
     pub view: Vec<u8>,
+    /// `fx, fy, cx, cy` of both, in their pixels.
+    pub intrinsics: Vec<f64>,
+    /// For each pixel of the photograph 1 where the model shows the object, 0 where not.
+    pub object: Vec<u8>,
 }
 
 /// The browser's GPU, with what the kernels can use of it.
@@ -160,15 +179,6 @@ async fn open_gpu() -> Result<Gpu, JsError> {
 fn pose(world_from_camera: &[f64]) -> Result<DMat4, JsError> {
     let rows: &[f64; 16] = world_from_camera.try_into().map_err(|_| JsError::new("a pose has 16 numbers"))?;
     Ok(DMat4::from_cols_array(rows).transpose())
-}
-
-/// Those of a square picture, the principal point in its middle.
-fn intrinsics(side: u32, focal: f64) -> Result<Intrinsics, JsError> {
-    if !(f64::MIN_POSITIVE..f64::INFINITY).contains(&focal) {
-        return Err(JsError::new(&format!("a focal length of {focal} pixels")));
-    }
-    let middle = f64::from(side) / 2.0;
-    Ok(Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.0 })
 }
 
 fn to_rgba(rgb: &[f32]) -> Vec<u8> {

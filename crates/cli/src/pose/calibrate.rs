@@ -190,11 +190,14 @@ impl AtTruth {
         let bar = progress::bar(all.len() as u64, "instances");
         let mut at_truth = BTreeMap::new();
         for Views { name, pictures, truths, .. } in all {
-            let true_views: Vec<View> =
-                pictures.iter().zip(truths).map(|(picture, truth)| (picture.instance, *truth, picture.intrinsics)).collect();
+            let true_views: Vec<View> = pictures
+                .iter()
+                .zip(truths)
+                .map(|(picture, truth)| (picture.shot.instance, *truth, picture.shot.intrinsics))
+                .collect();
             let renders = render(on, &true_views)?;
             let part = |(picture, render): (&Picture, &Rendering)| {
-                (picture.name.clone(), unexplained(&picture.rgb, picture.weights.as_deref(), &render.rgb))
+                (picture.name.clone(), unexplained(&picture.shot.rgb, picture.shot.weights.as_deref(), &render.rgb))
             };
             let parts = pictures.iter().zip(&renders).map(part);
             at_truth.insert(name.clone(), parts.filter(|(_, part)| part.is_finite()).collect());
@@ -265,7 +268,7 @@ impl Searches {
         let mut lost = Vec::new();
         for (views, symmetries) in asked.iter().zip(&symmetries) {
             let far = |(picture, truth): (&Picture, &DMat4)| -> Result<Vec<DMat4>> {
-                let all = args.search.starts(&Starts::Around84, on.model, picture, on.side, None, &Notation::default())?;
+                let all = args.search.starts(&Starts::Around84, on.model, &picture.shot, None, &Notation::default())?;
                 Ok(all.into_iter().filter(|start| PoseError::of(start, truth).rotation_deg > FAR_DEG).collect())
             };
             let starts = views.pictures.iter().zip(&views.truths).map(far).collect::<Result<Vec<_>>>()?;

@@ -8,13 +8,12 @@ use clap::Args;
 use glam::DMat4;
 use indicatif::ProgressBar;
 use serde::Serialize;
+use sigma_srn::photo::{BoundingBox, Boxed, Known, Outcome, Shot};
 use sigma_srn::{Confidence, Doubt, Found, Light, Model, Pose6};
 use srn_data::camera::Axes;
-use srn_data::segment::{BoundingBox, Known};
 use srn_data::target::Cutout;
 
-use super::boxed::{Boxed, Outcome, bounding_box};
-use super::files::{Masks, ObjectArgs, Picture, PoseSource, model_side, srn_instance, warn_of_turned};
+use super::files::{Masks, ObjectArgs, Picture, PoseSource, bounding_box, model_side, srn_instance, warn_of_turned};
 use super::mask::MadeRight;
 use super::notation::{Notation, NotationArgs, ObjectPose};
 use super::outline;
@@ -182,9 +181,9 @@ pub fn run(args: &Estimate) -> Result<bool> {
     if !args.rough.is_empty() && *starts != Starts::Neighbor4 {
         return Err(format!("--rough is what --starts neighbor4 turns; {starts} does without it").into());
     }
-    let starts_of =
-        |number: usize, picture: &Picture| args.search.starts(starts, &model, picture, side, rough[number].as_ref(), &notation);
-    let starts = pictures.iter().enumerate().map(|(number, picture)| starts_of(number, picture)).collect::<Result<Vec<_>>>()?;
+    let starts_of = |number: usize, shot: &Shot| args.search.starts(starts, &model, shot, rough[number].as_ref(), &notation);
+    let starts =
+        pictures.iter().enumerate().map(|(number, picture)| starts_of(number, &picture.shot)).collect::<Result<Vec<_>>>()?;
     if let Some(dir) = &args.record {
         let of = |end: &'static str| pictures.iter().map(move |p| dir.join(format!("{}{end}", p.name)));
         let files = [".png", ".gif", "-outline.png"].into_iter().flat_map(of);
@@ -213,22 +212,18 @@ pub fn run(args: &Estimate) -> Result<bool> {
 
 /// Poses of pictures of objects in the model; `starts_of` a picture with this number.
 fn searched(
-    starts_of: &dyn Fn(usize, &Picture) -> Result<Vec<DMat4>>,
+    starts_of: &dyn Fn(usize, &Shot) -> Result<Vec<DMat4>>,
     mut saved: Option<SavedViews>,
     output: &mut Output,
 ) -> Result<()> {
     let &mut Output { args, on, pictures: all, .. } = output;
     let is_boxed = !args.boxes.is_empty();
     let settings = if is_boxed { args.search.single(args.search.options()?) } else { args.search.search()? };
-    let open = |number: usize, known: Known| {
-        let Picture { ref name, truth, .. } = all[number];
-        Ok(Picture { name: name.clone(), truth, ..opened(args, on.model, on.side, number, known)? })
-    };
     let bar = progress::bar(0, "steps");
     let (mut left, mut before) = (all.len().div_ceil(AT_ONCE) as u64 * if is_boxed { 2 } else { 1 }, 0);
-    let mut pass = |pictures: Vec<Picture>, starts: &[Vec<DMat4>]| -> Result<Vec<Outcome>> {
+    let mut pass = |pictures: &[Picture], starts: &[Vec<DMat4>]| -> Result<Vec<Outcome<_>>> {
         let mut log = Log::default();
-        let found = search(&settings, on, &pictures, starts, |mut progress| {
+        let found = search(&settings, on, pictures, starts, |mut progress| {
             bar.set_length(before + left * u64::from(progress.steps));
             if progress.search > 0 && progress.step == 0 {
                 bar.set_message(format!("{}, once more", pictures[progress.hypotheses[0].0].name));
@@ -240,25 +235,34 @@ fn searched(
         (left, before) = ((left - 1).max(1), bar.position());
         bar.set_message("");
         let log = Rc::new(log);
-        let outcome = |(i, (picture, found))| Outcome { picture, found, log: (log.clone(), i) };
-        Ok(pictures.into_iter().zip(found).enumerate().map(outcome).collect())
+        let outcome =
+            |(i, (picture, found)): (_, (&Picture, _))| Outcome { shot: picture.shot.clone(), found, log: (log.clone(), i) };
+        Ok(pictures.iter().zip(found).enumerate().map(outcome).collect())
     };
     for first in (0..all.len()).step_by(AT_ONCE) {
         let numbers: Vec<usize> = (first..all.len()).take(AT_ONCE).collect();
-        let pictures = all[first..][..numbers.len()].to_vec();
+        let pictures = &all[first..][..numbers.len()];
         let outcomes = if is_boxed {
-            Boxed { on, open: &open, starts: starts_of }.search(&numbers, pictures, &mut pass)?
+            let open = |number: usize, known: Known| Ok(opened(args, on.model, on.side, number, known)?.shot);
+            let boxed = Boxed { engine: on.engine, model: on.model, open: &open, starts: starts_of };
+            let shots = pictures.iter().map(|picture| picture.shot.clone()).collect();
+            boxed.search(&numbers, shots, &mut |numbers: &[usize], shots, starts: &[_]| {
+                let named = |(&number, shot): (&usize, _)| Picture { shot, ..all[number].clone() };
+                pass(&numbers.iter().zip(shots).map(named).collect::<Vec<_>>(), starts)
+            })?
         } else {
-            let starts = numbers.iter().zip(&pictures).map(|(&number, picture)| starts_of(number, picture));
+            let starts = numbers.iter().zip(pictures).map(|(&number, picture)| starts_of(number, &picture.shot));
             let starts = starts.collect::<Result<Vec<_>>>()?;
             pass(pictures, &starts)?
         };
-        for Outcome { picture, found, .. } in &outcomes {
-            output.add(picture, on.model.instance_name(picture.instance), found, found.estimate.ranking.len(), &bar)?;
+        let named = |(picture, outcome): (&Picture, &Outcome<_>)| Picture { shot: outcome.shot.clone(), ..picture.clone() };
+        let pictures: Vec<Picture> = pictures.iter().zip(&outcomes).map(named).collect();
+        for (picture, Outcome { found, .. }) in pictures.iter().zip(&outcomes) {
+            output.add(picture, on.model.instance_name(picture.shot.instance), found, found.estimate.ranking.len(), &bar)?;
             saved.iter_mut().try_for_each(|saved| saved.add(picture, found, on.side))?;
         }
         if let Some(dir) = &args.record {
-            for (number, Outcome { picture, found, log: (log, i) }) in numbers.into_iter().zip(&outcomes) {
+            for ((number, picture), Outcome { found, log: (log, i), .. }) in numbers.into_iter().zip(&pictures).zip(&outcomes) {
                 log.write(dir, *i, picture, found, on)?;
                 outline::write(dir, &args.images[number], picture, found, on)?;
             }
@@ -413,12 +417,12 @@ impl Output<'_> {
             doubt: found.doubt,
             confidence: found.confidence,
             light: found.estimate.light,
-            mask: MadeRight::of(&found.estimate, picture.pixels_on_disk(self.on.side)),
+            mask: MadeRight::of(&found.estimate, picture.shot.pixels_of_photo()),
             rival: found.estimate.rival().map(rival),
             searches: found.searches,
             start: found.estimate.ranking[0].start,
             error: error(&found.world_from_camera),
-            within_95: picture.truth.and_then(|truth| within_95(self.on.model, picture.instance, found, &truth)),
+            within_95: picture.truth.and_then(|truth| within_95(self.on.model, picture.shot.instance, found, &truth)),
             ranking: found.estimate.ranking.iter().filter(went_on).map(ranked).collect(),
             seconds: found.seconds,
         }

@@ -200,7 +200,7 @@ pub(super) fn view_report(
         unexplained: found.unexplained,
         trusted: found.is_trusted(),
         confidence: found.confidence,
-        within_95: within_95(model, picture.instance, found, truth),
+        within_95: within_95(model, picture.shot.instance, found, truth),
         rival_higher: found.estimate.rival().map(|(_, higher)| higher),
         searches: found.searches,
         seconds: found.seconds,
@@ -216,9 +216,9 @@ pub(super) fn pictures_sheet(results: &[(ViewReport, &Picture, Found)], side: u3
     let mut cells = Vec::new();
     for (report, picture, found) in order.into_iter().take(most) {
         let views = [
-            draw::view(&picture.rgb, side, SHOWN),
+            draw::view(&picture.shot.rgb, side, SHOWN),
             draw::view(&found.view, side, SHOWN),
-            draw::difference(&picture.rgb, &found.view, side, SHOWN),
+            draw::difference(&picture.shot.rgb, &found.view, side, SHOWN),
         ];
         let mut row = sheet::blank(3 * views[0].width() + 16, views[0].height() + 8);
         for (view, k) in views.iter().zip(0i64..) {

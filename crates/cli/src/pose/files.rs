@@ -8,18 +8,15 @@ use clap::Args;
 use glam::DMat4;
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::{Delay, Frame, RgbImage};
-use sigma_srn::{Intrinsics, Model, Outline, write_atomically};
+use sigma_srn::photo::{BoundingBox, Shot};
+use sigma_srn::{Model, write_atomically};
 use srn_data::formats::mask_in;
 use srn_data::srn::{self, picture_size};
-use srn_data::target::{Cutout, MARGIN, Target};
+use srn_data::target::{self, Cutout};
 
 use super::notation::Notation;
 use super::positive;
 use crate::common::Result;
-
-/// How long objects are in a picture, as a share of their diagonal: about that of a cube, of a ball in its box, and seen along the
-/// longest side.
-const SPAN: f64 = 0.8;
 
 /// Where all channels are at least this (of [-1, 1]) a picture shows background.
 const WHITE: f32 = 0.98;
@@ -78,6 +75,16 @@ impl CameraArgs {
     }
 }
 
+/// The value of --box.
+pub fn bounding_box(text: &str) -> std::result::Result<BoundingBox, String> {
+    let numbers: Vec<f64> =
+        text.split(',').filter_map(|number| number.trim().parse().ok()).filter(|n: &f64| n.is_finite()).collect();
+    match (&numbers[..], text.matches(',').count()) {
+        (&[x, y, width, height], 3) if width > 0.0 && height > 0.0 => Ok(BoundingBox { corner: [x, y], size: [width, height] }),
+        _ => Err("expected left edge, top edge, width and height in pixels: `120,80,200,160`".into()),
+    }
+}
+
 /// A pose file, or the one that belongs to a picture in an SRN folder, which is as data sets are.
 #[derive(Clone, Debug)]
 pub enum PoseSource {
@@ -127,37 +134,18 @@ pub fn srn_instance(picture: &Path) -> Option<PathBuf> {
     folder.parent().filter(|_| is_rgb).map(PathBuf::from)
 }
 
-/// A picture as the model takes it.
+/// A picture that is searched for.
 #[derive(Clone, Debug)]
 pub struct Picture {
     /// Short name, unique among the pictures of a run.
     pub name: String,
-    /// Number of the instance that it shows.
-    pub instance: u32,
-    /// Colours in [-1, 1], `[side, side, 3]`.
-    pub rgb: Vec<f32>,
-    /// How much each pixel counts `[side, side]`; `None`: all the same.
-    pub weights: Option<Vec<f32>>,
-    /// How much of each pixel is the object `[side, side]`, where it was cut out; the rest of it is white.
-    pub coverage: Option<Vec<f32>>,
-    /// How its mask is known to be wrong, in these pixels; see [`sigma_srn::Query::outline`].
-    pub outline: Outline,
-    /// Intrinsics of the resampled picture.
-    pub intrinsics: Intrinsics,
     /// Its true `world_from_camera`, if known.
     pub truth: Option<DMat4>,
-    /// How far the object is in object units, by the size of the square that was cut around it.
-    pub distance: Option<f64>,
-    /// Where the square lies in the picture as it is on disk: first pixel, width and height.
-    pub square: ([i64; 2], usize),
+    /// What the model takes of it.
+    pub shot: Shot,
 }
 
 impl Picture {
-    /// How many of its pixels on disk, along a row, are one of the `side` that are compared.
-    pub fn pixels_on_disk(&self, side: u32) -> f64 {
-        self.square.1 as f64 / f64::from(side)
-    }
-
     /// Reads a picture as a square of `side` pixels. In an SRN folder the intrinsics and the instance's name are found beside it; a
     /// picture from elsewhere, or with a mask that cuts it out, is cut around what masks and transparency leave.
     pub fn open(
@@ -184,26 +172,15 @@ impl Picture {
         let mask = file(masks.mask)?;
         let segmentation = file(if let Some(Cutout::Mask(mask)) = masks.cutout { Some(mask) } else { None })?;
         let cutout = segmentation.as_deref().map(Cutout::Mask).or(masks.cutout);
-        let target = match (&dir, cutout) {
-            (Some(_), None) => Target::of_view(path, mask.as_deref(), &intrinsics, side as usize)?,
-            _ => Target::of_photo(path, cutout, mask.as_deref(), &intrinsics, side as usize)?,
+        let square = match (&dir, cutout) {
+            (Some(_), None) => target::of_view(path, mask.as_deref(), &intrinsics, side as usize)?,
+            _ => target::of_photo(path, cutout, mask.as_deref(), &intrinsics, side as usize)?,
         };
-        if target.rgb.iter().all(|&colour| colour >= WHITE) {
+        if square.rgb.iter().all(|&colour| colour >= WHITE) {
             return Err(about("nothing but white: no object is in it").into());
         }
-        let [fx, fy, cx, cy] = target.intrinsics.map(f64::from);
-        Ok(Picture {
-            name: format!("{}-{stem}", model.instance_name(instance)),
-            instance,
-            rgb: target.rgb,
-            weights: target.weights,
-            coverage: target.coverage,
-            outline: Outline::AS_GIVEN,
-            intrinsics: Intrinsics { fx, fy, cx, cy, pixel_center: 0.0 },
-            truth: None,
-            distance: target.cut.then(|| fx * SPAN * (1.0 + 2.0 * MARGIN) / f64::from(side)),
-            square: (target.corner, target.extent),
-        })
+        let name = format!("{}-{stem}", model.instance_name(instance));
+        Ok(Picture { name, truth: None, shot: Shot::of(square, instance) })
     }
 }
 

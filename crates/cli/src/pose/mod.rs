@@ -1,13 +1,11 @@
 //! `sigma-pose`: poses of pictures, the paper's protocol on a data set, novel views.
 
 pub mod bake;
-mod boxed;
 pub mod calibrate;
 mod draw;
 pub mod estimate;
 pub mod evaluate;
 mod files;
-mod follow;
 mod heldout;
 mod mask;
 mod notation;

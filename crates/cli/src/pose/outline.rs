@@ -2,40 +2,42 @@
 
 use std::path::Path;
 
-use glam::DMat4;
 use image::imageops::{self, FilterType};
 use image::{Rgb, RgbImage};
-use sigma_srn::{Found, Intrinsics};
-use srn_data::pixels::Pixels;
-use srn_data::segment::BoundingBox;
+use sigma_srn::Found;
+use sigma_srn::photo::{FoundObject, Shot};
+use srn_data::pixels::{open, rgb8};
 use srn_data::sheet::{self, BLACK, Colour};
 
 use super::files::Picture;
-use super::search::{On, render};
+use super::search::On;
 use crate::common::{Result, write_picture};
 
 /// Colour of the line; its rim is black.
 const LINE: Colour = [60, 255, 90];
 /// For a line the view is rendered at most at this many times the side that the model takes.
 const FINEST: usize = 4;
-/// It shows this many times the square's width: an object of which only a part counts reaches out of its square.
-const WIDER: usize = 2;
 /// Shorter pictures are enlarged until they have this height, pixels.
 const LEAST_HEIGHT: u32 = 320;
 
 /// Writes `NAME-outline.png` of the picture at `path` to `dir`.
 pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, on: On) -> Result<()> {
-    let photo = Pixels::open(path)?.to_rgb8();
+    let photo = photograph(path)?;
     let page = sheet::enlarge(&photo, LEAST_HEIGHT.div_ceil(photo.height()));
-    let object = FoundObject::of(picture, &found.world_from_camera, on, FINEST)?;
+    let object = FoundObject::of(&picture.shot, &found.world_from_camera, on.engine, on.model, FINEST)?;
     write_picture(&dir.join(format!("{}-outline.png", picture.name)), &outlined(page, photo.height(), &object))
 }
 
 /// The picture at `path`, so many pixels high, with the outline on it, which is as fine as the model's own view.
-pub fn shown(path: &Path, picture: &Picture, found: &Found, on: On, height: u32) -> Result<RgbImage> {
-    let photo = Pixels::open(path)?.to_rgb8();
+pub fn shown(path: &Path, shot: &Shot, found: &Found, on: On, height: u32) -> Result<RgbImage> {
+    let photo = photograph(path)?;
     let page = imageops::resize(&photo, (photo.width() * height).div_ceil(photo.height()), height, FilterType::Triangle);
-    Ok(outlined(page, photo.height(), &FoundObject::of(picture, &found.world_from_camera, on, 1)?))
+    Ok(outlined(page, photo.height(), &FoundObject::of(shot, &found.world_from_camera, on.engine, on.model, 1)?))
+}
+
+fn photograph(path: &Path) -> Result<RgbImage> {
+    let picture = open(path)?;
+    Ok(rgb8(&picture.data, picture.width, picture.height))
 }
 
 /// A page that shows a picture of this height.
@@ -43,141 +45,6 @@ fn outlined(mut page: RgbImage, height: u32, object: &FoundObject) -> RgbImage {
     let pixel = f64::from(height) / f64::from(page.height());
     draw(&mut page, |at| object.covers(at.map(|x| (x as f64 + 0.5) * pixel)));
     page
-}
-
-/// Where the model shows the found object in the picture as it is on disk.
-pub struct FoundObject {
-    silhouette: Silhouette,
-    square: ([i64; 2], usize),
-}
-
-impl FoundObject {
-    /// By a view at most so many times as fine as the model's own.
-    pub fn of(picture: &Picture, world_from_camera: &DMat4, on: On, finest: usize) -> Result<Self> {
-        let side = on.side;
-        let times = picture.square.1.div_ceil(side as usize).clamp(1, finest) as u32;
-        let (k, before) = (f64::from(times), 0.5 * (WIDER - 1) as f64 * f64::from(side));
-        let Intrinsics { fx, fy, cx, cy, pixel_center } = picture.intrinsics;
-        // Edges of pixels stay where they are, half a pixel before the centres.
-        let [cx, cy] = [cx, cy].map(|c| k * (c + before + 0.5) - 0.5);
-        let view_side = WIDER as u32 * times * side;
-        let camera = Intrinsics { fx: k * fx, fy: k * fy, cx, cy, pixel_center };
-        let view = &render(On { side: view_side, ..on }, &[(picture.instance, *world_from_camera, camera)])?[0];
-        Ok(FoundObject { silhouette: Silhouette::of(&view.rgb, view_side as usize), square: picture.square })
-    }
-
-    /// A box around it, in pixels; `None` where the view shows nothing.
-    pub fn bounds(&self) -> Option<BoundingBox> {
-        let (corner, extent) = self.square;
-        let [first, last] = self.silhouette.bounds()?;
-        let in_picture = |k: usize, at: f64| corner[k] as f64 + extent as f64 * (WIDER as f64 * (at - 0.5) + 0.5);
-        let size = [0, 1].map(|k| (WIDER * extent) as f64 * (last[k] - first[k]));
-        Some(BoundingBox { corner: [0, 1].map(|k| in_picture(k, first[k])), size })
-    }
-
-    /// The part of what it covers, or another does, that both cover; 0 where that is nothing.
-    pub fn overlap(&self, other: &Self) -> f64 {
-        const CELLS: usize = 64;
-        let Some([a, b]) = self.bounds().zip(other.bounds()).map(<[_; 2]>::from) else { return 0.0 };
-        let first = [0, 1].map(|k| a.corner[k].min(b.corner[k]));
-        let end = [0, 1].map(|k| (a.corner[k] + a.size[k]).max(b.corner[k] + b.size[k]));
-        let place = |cell: [usize; 2]| [0, 1].map(|k| first[k] + (cell[k] as f64 + 0.5) / CELLS as f64 * (end[k] - first[k]));
-        let cells = (0..CELLS * CELLS).map(|i| place([i % CELLS, i / CELLS])).map(|at| (self.covers(at), other.covers(at)));
-        let (both, any) = cells.fold((0, 0), |(both, any), (a, b)| (both + usize::from(a && b), any + usize::from(a || b)));
-        f64::from(both as u32) / f64::from(any.max(1) as u32)
-    }
-
-    /// Whether it covers a place, in pixels; their edges are whole numbers.
-    pub fn covers(&self, at: [f64; 2]) -> bool {
-        self.silhouette.covers(self.in_view(at))
-    }
-
-    /// Whether a place shows it; of white within its outline nobody knows.
-    pub fn shows(&self, at: [f64; 2]) -> Option<bool> {
-        let at = self.in_view(at);
-        (!self.silhouette.is_enclosed(at)).then(|| self.silhouette.covers(at))
-    }
-
-    /// A place of the picture in the view, 0 to 1 across and down.
-    fn in_view(&self, at: [f64; 2]) -> [f64; 2] {
-        let (corner, extent) = self.square;
-        let in_square = [0, 1].map(|k| (at[k] - corner[k] as f64) / extent as f64);
-        in_square.map(|x| (x - 0.5) / WIDER as f64 + 0.5)
-    }
-}
-
-/// Where a view shows the object.
-struct Silhouette {
-    side: usize,
-    /// How far from white each pixel is.
-    darkness: Vec<f32>,
-    /// Half as dark as the object is, by its median: between object and background pixels are of both.
-    limit: f32,
-    /// White that no way leads to from the edge: print on the object, or what is seen through it.
-    enclosed: Vec<bool>,
-}
-
-impl Silhouette {
-    fn of(rgb: &[f32], side: usize) -> Self {
-        let far = |pixel: &[f32]| pixel.iter().map(|c| 1.0 - c.clamp(-1.0, 1.0)).fold(0.0, f32::max);
-        let darkness: Vec<f32> = rgb.chunks_exact(3).map(far).collect();
-        let mut object: Vec<f32> = darkness.iter().copied().filter(|&d| d > 0.2).collect();
-        object.sort_by(f32::total_cmp);
-        let limit = object.get(object.len() / 2).map_or(f32::INFINITY, |median| 0.5 * median);
-        Silhouette { side, darkness, limit, enclosed: vec![] }.filled()
-    }
-
-    /// What is enclosed counts as object.
-    fn filled(mut self) -> Self {
-        let n = self.side;
-        let mut reached = vec![false; n * n];
-        let mut next: Vec<usize> = (0..n).flat_map(|i| [i, n * (n - 1) + i, n * i, n * i + n - 1]).collect();
-        while let Some(pixel) = next.pop() {
-            if self.darkness[pixel] > self.limit || std::mem::replace(&mut reached[pixel], true) {
-                continue;
-            }
-            let (x, y) = (pixel % n, pixel / n);
-            let around = [(x > 0).then(|| pixel - 1), (x + 1 < n).then_some(pixel + 1)];
-            let above = [(y > 0).then(|| pixel - n), (y + 1 < n).then_some(pixel + n)];
-            next.extend(around.into_iter().chain(above).flatten());
-        }
-        let limit = self.limit;
-        self.enclosed = self.darkness.iter().zip(reached).map(|(darkness, reached)| !reached && *darkness <= limit).collect();
-        let enclosed = self.darkness.iter_mut().zip(&self.enclosed).filter(|(_, is_enclosed)| **is_enclosed);
-        enclosed.for_each(|(darkness, _)| *darkness = 2.0 * limit);
-        self
-    }
-
-    /// First and last place that the object covers, 0 to 1 across and down.
-    fn bounds(&self) -> Option<[[f64; 2]; 2]> {
-        let covered = self.darkness.iter().enumerate().filter(|(_, darkness)| **darkness > self.limit);
-        let cells = covered.map(|(i, _)| [i % self.side, i / self.side]);
-        let around = |bounds: Option<[[usize; 2]; 2]>, cell: [usize; 2]| {
-            let [low, high] = bounds.unwrap_or([cell; 2]);
-            Some([[0, 1].map(|k| low[k].min(cell[k])), [0, 1].map(|k| high[k].max(cell[k] + 1))])
-        };
-        let ends = cells.fold(None, around)?;
-        Some(ends.map(|end| end.map(|cells| cells as f64 / self.side as f64)))
-    }
-
-    fn is_enclosed(&self, at: [f64; 2]) -> bool {
-        let [x, y] = at.map(|x| (x * self.side as f64).floor());
-        let is_in = [x, y].iter().all(|x| (0.0..self.side as f64).contains(x));
-        is_in && self.enclosed[y as usize * self.side + x as usize]
-    }
-
-    /// Whether the object covers a place of the view, 0 to 1 across and down; smooth between pixels.
-    fn covers(&self, at: [f64; 2]) -> bool {
-        if !at.iter().all(|x| (0.0..1.0).contains(x)) {
-            return false;
-        }
-        let last = self.side - 1;
-        let [x, y] = at.map(|x| (x * self.side as f64 - 0.5).clamp(0.0, last as f64));
-        let ([x0, y0], [fx, fy]) = ([x as usize, y as usize], [x.fract() as f32, y.fract() as f32]);
-        let [x1, y1] = [x0, y0].map(|i| (i + 1).min(last));
-        let row = |y: usize| (1.0 - fx) * self.darkness[y * self.side + x0] + fx * self.darkness[y * self.side + x1];
-        (1.0 - fy) * row(y0) + fy * row(y1) > self.limit
-    }
 }
 
 /// Draws the border of a region, as thick as the picture is large.
@@ -208,36 +75,9 @@ mod tests {
 
     #[test]
     fn the_line_lies_on_the_edge() {
-        // Grey from the middle on to the right, white before; the limit lies half-way, and so does the line.
-        let rgb: Vec<f32> = (0..64).flat_map(|i| [if i % 8 < 4 { 1.0 } else { 0.0 }; 3]).collect();
-        let silhouette = Silhouette::of(&rgb, 8);
-        assert!(!silhouette.covers([0.49, 0.3]) && silhouette.covers([0.51, 0.3]));
-        assert!(!silhouette.covers([1.2, 0.3]) && !silhouette.covers([0.9, -0.1]));
         let mut page = sheet::blank(100, 50);
-        draw(&mut page, |[x, y]| silhouette.covers([x as f64 / 100.0, y as f64 / 50.0]));
+        draw(&mut page, |[x, _]| x >= 50);
         let green: Vec<u32> = page.enumerate_pixels().filter(|(.., p)| p.0 == LINE).map(|(x, ..)| x).collect();
         assert!(green.len() >= 49 && green.iter().all(|x| (50..=51).contains(x)), "{green:?}");
-        // White that is enclosed belongs to the object.
-        let ring = |i: usize| (2..=5).contains(&(i % 8)) && (2..=5).contains(&(i / 8));
-        let hole = |i: usize| (3..=4).contains(&(i % 8)) && (3..=4).contains(&(i / 8));
-        let rgb: Vec<f32> = (0..64).flat_map(|i| [if ring(i) && !hole(i) { -1.0 } else { 1.0 }; 3]).collect();
-        let silhouette = Silhouette::of(&rgb, 8);
-        assert!(silhouette.covers([0.5, 0.5]) && silhouette.covers([0.3, 0.5]) && !silhouette.covers([0.1, 0.5]));
-        assert!(silhouette.is_enclosed([0.5, 0.5]) && !silhouette.is_enclosed([0.3, 0.5]) && !silhouette.is_enclosed([0.1, 0.5]));
-        assert_eq!(silhouette.bounds(), Some([[0.25; 2], [0.75; 2]]));
-        // In a square that begins at (10, 20) and is 4 pixels wide, of which the view shows twice as much.
-        let object = |x: i64| FoundObject { silhouette: Silhouette::of(&rgb, 8), square: ([x, 20], 4) };
-        let bounds = object(10).bounds().unwrap();
-        assert_eq!((bounds.corner, bounds.size), ([10.0, 20.0], [4.0; 2]));
-        assert_eq!(
-            (object(10).shows([10.3, 22.0]), object(10).shows([12.0, 22.0]), object(10).shows([9.0, 22.0])),
-            (Some(true), None, Some(false))
-        );
-        let by_a_quarter = object(10).overlap(&object(11));
-        assert!(object(10).overlap(&object(10)) == 1.0 && (by_a_quarter - 0.6).abs() < 0.05, "{by_a_quarter}");
-        assert_eq!(object(10).overlap(&object(30)), 0.0);
-        // A white view has no outline.
-        let nothing = Silhouette::of(&[1.0; 192], 8);
-        assert!(!nothing.covers([0.5, 0.5]) && nothing.bounds().is_none());
     }
 }

@@ -77,7 +77,8 @@ impl Log {
         let last = path.last().map_or(0, |point| point.step);
         path.push(Point { step: last, loss: found.estimate.loss, world_from_camera: found.world_from_camera });
         let chosen = frames(&path);
-        let views: Vec<_> = chosen.iter().map(|&i| (picture.instance, path[i].world_from_camera, picture.intrinsics)).collect();
+        let views: Vec<_> =
+            chosen.iter().map(|&i| (picture.shot.instance, path[i].world_from_camera, picture.shot.intrinsics)).collect();
         let renders = render(on, &views)?;
         let page = Page { log: self, index, picture, found, side: on.side, path: &path, chosen: &chosen };
         let rgb: Vec<&[f32]> = renders.iter().map(|render| &render.rgb[..]).collect();
@@ -145,10 +146,10 @@ impl Page<'_> {
     }
 
     fn target(&self) -> Panel {
-        let rgb = self.counted(&self.picture.rgb, [-0.2, -0.2, 0.2]);
+        let rgb = self.counted(&self.picture.shot.rgb, [-0.2, -0.2, 0.2]);
         let mut captions = vec!["the picture given".into()];
         captions.extend(self.found.estimate.weights.as_ref().map(|_| "blue-grey: not counted".into()));
-        captions.extend(MadeRight::of(&self.found.estimate, self.picture.pixels_on_disk(self.side)).captions());
+        captions.extend(MadeRight::of(&self.found.estimate, self.picture.shot.pixels_of_photo()).captions());
         Panel { heading: "TARGET".into(), view: draw::view(&rgb, self.side, SHOWN), captions }
     }
 

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::path::Path;
 
+use sigma_srn::photo::Shot;
 use sigma_srn::{Found, Intrinsics, Model};
 use srn_data::pixels::rgb8;
 use srn_data::srn::{self, InstanceWriter};
@@ -22,7 +23,7 @@ impl SavedViews {
     pub fn create(dir: &Path, model: &Model, pictures: &[Picture], force: bool) -> Result<Self> {
         create_dir(dir)?;
         let mut instances = BTreeMap::new();
-        for &Picture { instance, .. } in pictures {
+        for &Picture { shot: Shot { instance, .. }, .. } in pictures {
             if let Entry::Vacant(entry) = instances.entry(instance) {
                 entry.insert((InstanceWriter::bare(dir.join(model.instance_name(instance)), force)?, 0));
             }
@@ -33,7 +34,7 @@ impl SavedViews {
     /// Takes a picture as it was compared in the end, `side` pixels square, if its pose is to be trusted. What did not count there is as
     /// the model shows it.
     pub fn add(&mut self, picture: &Picture, found: &Found, side: u32) -> Result<()> {
-        let Some((writer, count)) = self.instances.get_mut(&picture.instance).filter(|_| found.is_trusted()) else {
+        let Some((writer, count)) = self.instances.get_mut(&picture.shot.instance).filter(|_| found.is_trusted()) else {
             return Ok(());
         };
         let mut rgb = found.estimate.target.clone();
@@ -46,7 +47,7 @@ impl SavedViews {
                 .for_each(|(seen, shown)| *seen += (1.0 - counts) * (shown - *seen));
         }
         let side = side as usize;
-        let Intrinsics { fx, fy, cx, cy, .. } = picture.intrinsics;
+        let Intrinsics { fx, fy, cx, cy, .. } = picture.shot.intrinsics;
         writer.add(&picture.name, &rgb8(&rgb, side, side), &found.world_from_camera)?;
         writer.view_intrinsics(&picture.name, &srn::Intrinsics { focal: [fx, fy], centre: [cx, cy], size: [side; 2] })?;
         *count += 1;

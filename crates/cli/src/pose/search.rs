@@ -7,9 +7,9 @@ use clap::{Args, ValueEnum};
 use glam::DMat4;
 use serde::Serialize;
 use sigma_srn::camera::{around84, around2016, fixed24, neighbor4, pose_error};
+use sigma_srn::photo::Shot;
 use sigma_srn::{
-    Confidence, Effort, Engine, Error, Found, Loss, Method, Model, Options, Progress, Query, Rendering, Search, View,
-    render_views,
+    Confidence, Effort, Engine, Error, Found, Loss, Method, Model, Options, Progress, Rendering, Search, View, render_views,
 };
 
 use super::files::Picture;
@@ -215,13 +215,13 @@ impl SearchArgs {
     /// Estimates the pose of an object that the model was not trained on. The model with the object is returned too.
     pub fn run_unseen(
         &self,
-        On { engine, model, side }: On,
+        On { engine, model, .. }: On,
         picture: &Picture,
         starts: &[DMat4],
         observe: impl FnMut(usize, usize) -> std::result::Result<(), Error>,
     ) -> Result<(Found, Model)> {
         let search = self.single(Options { seed: self.seed, ..Options::default() });
-        Ok(search.run_unseen(engine, model, &query(picture, side, starts), observe)?)
+        Ok(search.run_unseen(engine, model, &picture.shot.query(starts.to_vec()), observe)?)
     }
 
     /// Where to start where nothing is known of the pose.
@@ -235,26 +235,24 @@ impl SearchArgs {
     }
 
     /// Starts all around the object, which appears in the middle of the picture.
-    fn around(&self, starts: fn(f64) -> Vec<DMat4>, model: &Model, picture: &Picture, side: u32) -> Result<Vec<DMat4>> {
-        let radius = self.radius.or(picture.distance).or(model.metadata.orbit_radius);
-        let radius = radius.ok_or("the model does not say how far its cameras were: give --radius")?;
-        Ok(picture.intrinsics.centred([side, side], starts(radius)))
+    fn around(&self, starts: fn(f64) -> Vec<DMat4>, model: &Model, shot: &Shot) -> Result<Vec<DMat4>> {
+        shot.around(model, starts, self.radius)
+            .map_err(|_| "the model does not say how far its cameras were: give --radius".into())
     }
 
-    /// The poses to start from for a picture of `side` pixels; `rough` is the one that `neighbor4` turns.
+    /// The poses to start from; `rough` is the one that `neighbor4` turns.
     pub fn starts(
         &self,
         starts: &Starts,
         model: &Model,
-        picture: &Picture,
-        side: u32,
+        shot: &Shot,
         rough: Option<&DMat4>,
         notation: &Notation,
     ) -> Result<Vec<DMat4>> {
         match starts {
-            Starts::Around2016 => self.around(around2016, model, picture, side),
-            Starts::Around84 => self.around(around84, model, picture, side),
-            Starts::Fixed24 => self.around(fixed24, model, picture, side),
+            Starts::Around2016 => self.around(around2016, model, shot),
+            Starts::Around84 => self.around(around84, model, shot),
+            Starts::Fixed24 => self.around(fixed24, model, shot),
             Starts::Neighbor4 => Ok(neighbor4(rough.ok_or("--starts neighbor4 turns a rough pose: give --rough")?)),
             Starts::File(path) if !path.exists() => Err(format!(
                 "--starts {}: no such file; expected around2016, around84, fixed24, neighbor4 or a file",
@@ -269,12 +267,12 @@ impl SearchArgs {
 /// Estimates the poses of `pictures`, each from its own starts.
 pub fn run(
     search: &Search,
-    On { engine, model, side }: On,
+    On { engine, model, .. }: On,
     pictures: &[Picture],
     starts: &[Vec<DMat4>],
     observe: impl FnMut(Progress) -> std::result::Result<(), Error>,
 ) -> Result<Vec<Found>> {
-    let queries: Vec<_> = pictures.iter().zip(starts).map(|(picture, starts)| query(picture, side, starts)).collect();
+    let queries: Vec<_> = pictures.iter().zip(starts).map(|(picture, starts)| picture.shot.query(starts.clone())).collect();
     with_cooperative_said(engine, || {
         search.run(engine, model, &queries, observe).map_err(|error| match error {
             Error::Query { number, what } => Error::Input { input: pictures[number].name.clone(), what }.into(),
@@ -292,21 +290,6 @@ pub fn with_cooperative_said<T>(engine: &Engine, run: impl FnOnce() -> Result<T>
         eprintln!("cooperative matrices {so}: with them pose gradients differ by {difference:.1e} of the largest");
     }
     Ok(found)
-}
-
-/// A picture as the library takes it.
-pub fn query(picture: &Picture, side: u32, starts: &[DMat4]) -> Query {
-    Query {
-        instance: picture.instance,
-        rgb: picture.rgb.clone(),
-        weights: picture.weights.clone(),
-        coverage: picture.coverage.clone(),
-        outline: picture.outline,
-        width: side,
-        height: side,
-        intrinsics: picture.intrinsics,
-        starts: starts.to_vec(),
-    }
 }
 
 /// Distance of a pose from the truth.
@@ -365,7 +348,7 @@ mod tests {
     use super::*;
     use clap::Parser;
     use glam::DVec3;
-    use sigma_srn::{Intrinsics, ModelConfig, Outline};
+    use sigma_srn::{Intrinsics, ModelConfig};
 
     #[derive(Parser)]
     struct Flags {
@@ -373,39 +356,23 @@ mod tests {
         search: SearchArgs,
     }
 
-    fn picture(intrinsics: Intrinsics) -> Picture {
-        let (name, square) = (String::new(), ([0; 2], 1));
-        Picture {
-            name,
-            instance: 0,
-            rgb: vec![],
-            weights: None,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            intrinsics,
-            truth: None,
-            square,
-            distance: None,
-        }
-    }
-
     #[test]
     fn starts_see_the_object_in_the_middle_of_a_cut() {
         let model = Model::init(&ModelConfig { hidden: 4, latent: 2, instances: 1, tracing_steps: 1, density: true }, 0).unwrap();
         let search = Flags::parse_from(["sigma-pose"]).search;
-        let starts = |picture: &Picture| {
-            search.starts(&Starts::Around84, &model, picture, 64, None, &Notation::default()).map_err(|e| e.to_string())
-        };
-        let cut = picture(Intrinsics { fx: 150.0, fy: 140.0, cx: -40.0, cy: 90.0, pixel_center: 0.0 });
+        let starts =
+            |shot: &Shot| search.starts(&Starts::Around84, &model, shot, None, &Notation::default()).map_err(|e| e.to_string());
+        let shot = |intrinsics| Shot::whole(vec![], intrinsics, 0, 64);
+        let cut = shot(Intrinsics { fx: 150.0, fy: 140.0, cx: -40.0, cy: 90.0, pixel_center: 0.0 });
         assert!(starts(&cut).unwrap_err().contains("--radius"));
-        for start in starts(&Picture { distance: Some(2.5), ..cut }).unwrap() {
+        for start in starts(&Shot { distance: Some(2.5), ..cut }).unwrap() {
             let DVec3 { x, y, z } = start.inverse().transform_point3(DVec3::ZERO);
             assert!((150.0 * x / z - 40.0 - 32.0).abs() < 1e-9 && (140.0 * y / z + 90.0 - 32.0).abs() < 1e-9, "{start}");
             assert!((start.w_axis.truncate().length() - 2.5).abs() < 1e-12);
         }
         // Pictures of data sets have their principal point there: nothing is turned.
-        let whole = picture(Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.0 });
-        assert_eq!(starts(&Picture { distance: Some(1.3), ..whole }).unwrap(), around84(1.3));
+        let whole = shot(Intrinsics { fx: 74.4, fy: 74.4, cx: 32.0, cy: 32.0, pixel_center: 0.0 });
+        assert_eq!(starts(&Shot { distance: Some(1.3), ..whole }).unwrap(), around84(1.3));
     }
 
     #[test]

@@ -39,7 +39,7 @@ impl Symmetries {
         let (Some(picture), Some(truth), true) = (views.pictures.first(), views.truths.first(), count) else {
             return Ok(Symmetries::none());
         };
-        Symmetries::find(on, picture.instance, picture.intrinsics, truth.w_axis.truncate().length())
+        Symmetries::find(on, picture.shot.instance, picture.shot.intrinsics, truth.w_axis.truncate().length())
     }
 
     /// Those of an instance, found by comparing the model's own views from `radius` away.

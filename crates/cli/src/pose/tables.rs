@@ -176,7 +176,7 @@ fn one_shot(on: On, asked: &[Views], search: &SearchArgs, starts: &Starts) -> Re
         bar.set_message(name.clone());
         let mut found = Vec::new();
         for (picture, truth) in pictures.iter().zip(truths) {
-            let starts = search.starts(starts, on.model, picture, on.side, Some(truth), &Notation::default())?;
+            let starts = search.starts(starts, on.model, &picture.shot, Some(truth), &Notation::default())?;
             found.push(search.run_unseen(on, picture, &starts, |_, _| Ok(()))?.0);
             bar.inc(1);
         }
@@ -405,23 +405,14 @@ impl Bench<'_> {
 mod tests {
     use super::*;
     use glam::DMat4;
-    use sigma_srn::{Intrinsics, Outline};
+    use sigma_srn::Intrinsics;
+    use sigma_srn::photo::Shot;
 
     #[test]
     fn few_views_come_from_all_instances_and_places() {
         let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pixel_center: 0.0 };
-        let picture = |name: usize| Picture {
-            name: name.to_string(),
-            instance: 0,
-            rgb: vec![],
-            weights: None,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            intrinsics,
-            truth: None,
-            distance: None,
-            square: ([0; 2], 1),
-        };
+        let shot = Shot::whole(vec![], intrinsics, 0, 1);
+        let picture = |name: usize| Picture { name: name.to_string(), truth: None, shot: shot.clone() };
         let views = |name: &str| Views {
             name: name.into(),
             dir: name.into(),

@@ -8,19 +8,17 @@ use clap::Args;
 use image::RgbImage;
 use indicatif::ProgressBar;
 use serde::Serialize;
+use sigma_srn::photo::{BoundingBox, Follower, Known, Looking, Shot};
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Tracked, Tracker};
 use srn_data::pixels::{ENDINGS, is_picture};
-use srn_data::segment::{BoundingBox, Known};
 use srn_data::target::Cutout;
 
-use super::boxed::bounding_box;
 use super::draw;
-use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, model_side, warn_of_turned};
-use super::follow::{Follower, Looking};
+use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, bounding_box, model_side, warn_of_turned};
 use super::mask::MadeRight;
 use super::notation::{NotationArgs, ObjectPose};
 use super::outline;
-use super::search::{On, PoseError, SearchArgs, Starts, deviation, query, with_cooperative_said};
+use super::search::{On, PoseError, SearchArgs, Starts, deviation, with_cooperative_said};
 use crate::common::{EngineArgs, Result, load_model, lossy, print, refuse_to_write};
 use crate::progress;
 
@@ -134,20 +132,20 @@ pub fn run(args: &Track) -> Result<bool> {
     for path in std::iter::once(Ok(first)).chain(frames) {
         let path = path?;
         let (began, mut bar) = (Instant::now(), None::<ProgressBar>);
-        let boxed = |bounds: BoundingBox, known: Known| open(&path, Some(Cutout::Box(bounds, known)));
-        let picture = match &follower {
+        let boxed = |bounds: BoundingBox, known: Known| Ok(open(&path, Some(Cutout::Box(bounds, known)))?.shot);
+        let shot = match &follower {
             Some(follower) => follower.open(&boxed),
-            None => open(&path, args.cutout.as_deref().map(Cutout::Mask)),
+            None => open(&path, args.cutout.as_deref().map(Cutout::Mask)).map(|picture| picture.shot),
         };
         let name = |number| model.instance_name(number);
-        let picture = picture.and_then(|picture| match followed {
-            Some(followed) if picture.instance != followed => {
-                Err(format!("{}: shows {}, but {} is followed", path.display(), name(picture.instance), name(followed)).into())
+        let shot = shot.and_then(|shot| match followed {
+            Some(followed) if shot.instance != followed => {
+                Err(format!("{}: shows {}, but {} is followed", path.display(), name(shot.instance), name(followed)).into())
             }
-            _ => Ok(picture),
+            _ => Ok(shot),
         });
-        let picture = match picture {
-            Ok(picture) => picture,
+        let shot = match shot {
+            Ok(shot) => shot,
             // The first says whether the flags are right; later ones come from a camera that may have lost the object.
             Err(failure) if tracker.is_some() => {
                 trusted = false;
@@ -169,19 +167,19 @@ pub fn run(args: &Track) -> Result<bool> {
             }
             truth => truth?,
         };
-        followed = Some(picture.instance);
+        followed = Some(shot.instance);
         let rough = args.rough.as_ref().filter(|_| tracker.is_none()).map(|rough| rough.read(&path, &notation)).transpose()?;
         let is_boxed = follower.is_some();
-        let starts = |picture: &Picture| {
+        let starts = |shot: &Shot| {
             let (starts, rough) = match &rough {
                 Some(rough) if is_boxed => (Starts::Neighbor4, Some(rough)),
                 _ => (args.search.all_around(), None),
             };
-            args.search.starts(&starts, &model, picture, side, rough, &notation)
+            args.search.starts(&starts, &model, shot, rough, &notation)
         };
         let tracker = match &mut tracker {
             Some(tracker) => tracker,
-            none => none.insert(Tracker::new(&engine, &model, picture.instance, search.clone(), rough)?),
+            none => none.insert(Tracker::new(&engine, &model, shot.instance, search.clone(), rough)?),
         };
         count += 1;
         let mut observe = |seen: Progress| {
@@ -195,18 +193,18 @@ pub fn run(args: &Track) -> Result<bool> {
         };
         let tracked = with_cooperative_said(&engine, || match &mut follower {
             Some(follower) => {
-                let looking = Looking { on, search: &search, starts: &starts, open: &boxed };
-                follower.next(picture, tracker, &looking, &mut observe)
+                let looking = Looking { engine: &engine, model: &model, search: &search, starts: &starts, open: &boxed };
+                follower.next(shot, tracker, &looking, &mut observe)
             }
             None => {
-                let tracked = tracker.next(query(&picture, side, &starts(&picture)?), &mut observe)?;
-                Ok((picture, tracked))
+                let tracked = tracker.next(shot.query(starts(&shot)?), &mut observe)?;
+                Ok((shot, tracked))
             }
         });
         bar.iter().for_each(ProgressBar::finish_and_clear);
-        let (picture, Tracked { found, is_searched: searched }) = tracked?;
+        let (shot, Tracked { found, is_searched: searched }) = tracked?;
         trusted = found.is_trusted();
-        let mask = MadeRight::of(&found.estimate, picture.pixels_on_disk(side));
+        let mask = MadeRight::of(&found.estimate, shot.pixels_of_photo());
         let error = truth.map(|truth| notation.error(PoseError::of(&found.world_from_camera, &truth)));
         errors.extend(error);
         searches += usize::from(searched);
@@ -216,8 +214,8 @@ pub fn run(args: &Track) -> Result<bool> {
                 none => none.insert(Animation::create(file)?),
             };
             // What is cut out is best seen on the frame that it was cut out of.
-            let whole = follower.as_ref().map(|_| outline::shown(&path, &picture, &found, on, SHOWN)).transpose()?;
-            animation.push(side_by_side(whole, &picture, &found, side), STAY)?;
+            let whole = follower.as_ref().map(|_| outline::shown(&path, &shot, &found, on, SHOWN)).transpose()?;
+            animation.push(side_by_side(whole, &shot, &found), STAY)?;
         }
         let written = notation.written(&found.world_from_camera);
         let report = FrameReport {
@@ -310,9 +308,10 @@ fn numbered(name: &str) -> Vec<(String, u128)> {
     parts
 }
 
-fn side_by_side(whole: Option<RgbImage>, picture: &Picture, found: &Found, side: u32) -> RgbImage {
+fn side_by_side(whole: Option<RgbImage>, shot: &Shot, found: &Found) -> RgbImage {
+    let side = shot.side;
     let views = [
-        draw::view(&picture.rgb, side, SHOWN),
+        draw::view(&shot.rgb, side, SHOWN),
         draw::view(&found.view, side, SHOWN),
         draw::difference(&found.estimate.target, &found.view, side, SHOWN),
     ];

@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use glam::DMat4;
-use sigma_srn::{Error, Found, Intrinsics, Model, Outline, Progress};
+use sigma_srn::photo::Shot;
+use sigma_srn::{Error, Found, Intrinsics, Model, Progress};
 use srn_data::LoadedView;
 use srn_data::srn::SrnSet;
 
@@ -68,7 +69,7 @@ pub fn search(
     // All starts are known before the first is searched for.
     let mut all_starts = Vec::new();
     for Views { pictures, truths, .. } in asked {
-        let of = |(picture, truth)| args.starts(starts, on.model, picture, on.side, Some(truth), notation);
+        let of = |(picture, truth): (&Picture, _)| args.starts(starts, on.model, &picture.shot, Some(truth), notation);
         all_starts.push(pictures.iter().zip(truths).map(of).collect::<Result<Vec<_>>>()?);
     }
     // Views of data sets have no masks to be made right.
@@ -94,20 +95,5 @@ pub fn search(
 pub fn picture(view: LoadedView, instance: u32, side: u32) -> (Picture, DMat4) {
     let (truth, intrinsics): (DMat4, Intrinsics) = camera(&view);
     let LoadedView { name, rgb, .. } = view;
-    let square = ([0; 2], side as usize);
-    (
-        Picture {
-            name,
-            instance,
-            rgb,
-            weights: None,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            intrinsics,
-            truth: Some(truth),
-            distance: None,
-            square,
-        },
-        truth,
-    )
+    (Picture { name, truth: Some(truth), shot: Shot::whole(rgb, intrinsics, instance, side) }, truth)
 }

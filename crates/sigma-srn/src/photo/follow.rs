@@ -1,14 +1,10 @@
 //! Frames of a video that are not cut out: where the object is in one says what of the next is the object.
 
 use glam::DMat4;
-use sigma_srn::{Error, Found, Progress, Search, Tracked, Tracker};
-use srn_data::segment::{BoundingBox, Known};
+use srn_photo::{BoundingBox, Known};
 
-use super::boxed::{Boxed, Outcome};
-use super::files::Picture;
-use super::outline::FoundObject;
-use super::search::{On, query, run};
-use crate::common::Result;
+use super::{Boxed, FoundObject, Outcome, Shot};
+use crate::{Engine, Error, Found, Model, Progress, Search, Tracked, Tracker};
 
 /// A frame is cut out anew by the pose that was found in it where what this covers and what was expected have no more than so much of both in common.
 const AS_EXPECTED: f64 = 0.9;
@@ -16,9 +12,9 @@ const AS_EXPECTED: f64 = 0.9;
 const SEARCHED: usize = 10;
 
 /// A frame, cut out by a box and what is known of the object in it.
-pub type Open<'a> = &'a dyn Fn(BoundingBox, Known) -> Result<Picture>;
+pub type Open<'a, E> = &'a dyn Fn(BoundingBox, Known) -> Result<Shot, E>;
 /// Watches a search.
-type Observe<'a> = &'a mut dyn FnMut(Progress) -> std::result::Result<(), Error>;
+pub type Observe<'a> = &'a mut dyn FnMut(Progress) -> Result<(), Error>;
 
 /// Follows an object of which nothing but a box around it in the first frame is known.
 pub struct Follower {
@@ -31,13 +27,17 @@ pub struct Follower {
 }
 
 /// How frames are looked at.
-pub struct Looking<'a> {
-    pub on: On<'a>,
+pub struct Looking<'a, E> {
+    /// What renders views.
+    pub engine: &'a Engine,
+    /// The model that knows the object.
+    pub model: &'a Model,
     /// All around.
     pub search: &'a Search,
     /// Where it starts.
-    pub starts: &'a dyn Fn(&Picture) -> Result<Vec<DMat4>>,
-    pub open: Open<'a>,
+    pub starts: &'a dyn Fn(&Shot) -> Result<Vec<DMat4>, E>,
+    /// The frame at hand.
+    pub open: Open<'a, E>,
 }
 
 impl Follower {
@@ -47,39 +47,41 @@ impl Follower {
     }
 
     /// A frame, cut out by where the object is expected in it; if nothing is there, by the box alone.
-    pub fn open(&self, open: Open) -> Result<Picture> {
+    pub fn open<E>(&self, open: Open<E>) -> Result<Shot, E> {
         let expected = self.expected.as_ref().and_then(|(object, bounds)| cut_out(*bounds, object, open).ok());
         expected.map_or_else(|| open(self.bounds, Known::default()), Ok)
     }
 
     /// Finds the pose in a frame that [`Follower::open`] has cut out; the frame comes back as it was cut out in the end.
-    pub fn next(
+    pub fn next<E: From<Error>>(
         &mut self,
-        picture: Picture,
+        shot: Shot,
         tracker: &mut Tracker,
-        looking: &Looking,
+        looking: &Looking<E>,
         observe: Observe,
-    ) -> Result<(Picture, Tracked)> {
-        let near = self.near(&picture, tracker, looking, observe)?;
+    ) -> Result<(Shot, Tracked), E> {
+        let near = self.near(&shot, tracker, looking, observe)?;
         let is_due = |found: &Found| !found.is_trusted() && self.doubted.is_multiple_of(SEARCHED);
         let around = match &near {
             Some((_, found)) if is_due(found) => (looking.open)(self.bounds, Known::default()).ok(),
             Some(_) => None,
-            None => Some(picture),
+            None => Some(shot),
         };
-        let around = around.map(|picture| self.around(picture, looking, observe)).transpose()?;
-        let is_better = |(_, other): &(Picture, Found)| {
+        let around = around.map(|shot| self.around(shot, looking, observe)).transpose()?;
+        let is_better = |(_, other): &(Shot, Found)| {
             other.is_trusted() || near.as_ref().is_none_or(|(_, found)| other.unexplained < found.unexplained)
         };
         let around = around.filter(is_better);
         let is_searched = around.is_some();
-        let (picture, found) = around.or(near).ok_or("no pose was looked for")?;
+        let Some((shot, found)) = around.or(near) else {
+            return Err(Error::Input { input: "frame".into(), what: "no pose was looked for".into() }.into());
+        };
         if is_searched {
             tracker.restart(found.world_from_camera);
         }
         self.doubted = if found.is_trusted() { 0 } else { self.doubted + 1 };
         let next = tracker.expected().unwrap_or(found.world_from_camera);
-        let object = FoundObject::of(&picture, &next, looking.on, 1)?;
+        let object = FoundObject::of(&shot, &next, looking.engine, looking.model, 1)?;
         if let Some(bounds) = object.bounds() {
             // What is followed in doubt may be something else, which leads away.
             if found.is_trusted() {
@@ -87,44 +89,40 @@ impl Follower {
             }
             self.expected = Some((object, bounds));
         }
-        Ok((picture, Tracked { found, is_searched }))
+        Ok((shot, Tracked { found, is_searched }))
     }
 
     /// From where it is expected.
-    fn near(
+    fn near<E: From<Error>>(
         &self,
-        picture: &Picture,
+        shot: &Shot,
         tracker: &mut Tracker,
-        looking: &Looking,
+        looking: &Looking<E>,
         observe: Observe,
-    ) -> Result<Option<(Picture, Found)>> {
-        let (Some((expected, _)), side) = (&self.expected, looking.on.side) else { return Ok(None) };
-        let Some(found) = tracker.follow(query(picture, side, &[]), &mut *observe)? else { return Ok(None) };
-        let object = FoundObject::of(picture, &found.world_from_camera, looking.on, 1)?;
+    ) -> Result<Option<(Shot, Found)>, E> {
+        let Some((expected, _)) = &self.expected else { return Ok(None) };
+        let Some(found) = tracker.follow(shot.query(vec![]), &mut *observe)? else { return Ok(None) };
+        let object = FoundObject::of(shot, &found.world_from_camera, looking.engine, looking.model, 1)?;
         let anew = object.bounds().filter(|_| object.overlap(expected) < AS_EXPECTED);
         let anew = anew.and_then(|bounds| cut_out(bounds, &object, looking.open).ok());
-        if let Some(picture) = anew
-            && let Some(found) = tracker.again(query(&picture, side, &[]), observe)?
+        if let Some(shot) = anew
+            && let Some(found) = tracker.again(shot.query(vec![]), observe)?
         {
-            return Ok(Some((picture, found)));
+            return Ok(Some((shot, found)));
         }
-        Ok(Some((picture.clone(), found)))
+        Ok(Some((shot.clone(), found)))
     }
 
     /// From all around, of a frame that was cut out by the box alone.
-    fn around(&self, picture: Picture, looking: &Looking, observe: Observe) -> Result<(Picture, Found)> {
-        let Looking { on, search, starts, open } = *looking;
-        let boxed = Boxed { on, open: &|_, known| open(self.bounds, known), starts: &|_, picture| starts(picture) };
-        let mut pass = |pictures: Vec<Picture>, starts: &[Vec<DMat4>]| {
-            let found = run(search, on, &pictures, starts, &mut *observe)?;
-            let outcome = |(picture, found)| Outcome { picture, found, log: Default::default() };
-            Ok(pictures.into_iter().zip(found).map(outcome).collect())
-        };
-        let Outcome { picture, found, .. } = boxed.search(&[0], vec![picture], &mut pass)?.remove(0);
-        Ok((picture, found))
+    fn around<E: From<Error>>(&self, shot: Shot, looking: &Looking<E>, observe: Observe) -> Result<(Shot, Found), E> {
+        let Looking { engine, model, search, starts, open } = *looking;
+        let boxed = Boxed { engine, model, open: &|_, known| open(self.bounds, known), starts: &|_, shot| starts(shot) };
+        let mut pass = |_: &[usize], shots, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut *observe)?);
+        let Outcome { shot, found, .. } = boxed.search(&[0], vec![shot], &mut pass)?.remove(0);
+        Ok((shot, found))
     }
 }
 
-fn cut_out(bounds: BoundingBox, object: &FoundObject, open: Open) -> Result<Picture> {
+fn cut_out<E>(bounds: BoundingBox, object: &FoundObject, open: Open<E>) -> Result<Shot, E> {
     open(bounds, Known { colours: &[], place: Some(&|at| object.shows(at)) })
 }

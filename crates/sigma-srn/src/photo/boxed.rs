@@ -1,0 +1,102 @@
+//! Photographs with boxes around their objects: what in a box is the object and where the object is are found in turns.
+
+use glam::DMat4;
+use srn_photo::Known;
+
+use super::{FoundObject, Shot};
+use crate::camera::{fixed24, neighbor4};
+use crate::renderer::render_views;
+use crate::{Engine, Error, Found, Intrinsics, Model, View};
+
+/// The model's object is looked at in pictures of so many pixels, for its colours.
+const SIDE: u32 = 32;
+/// Where all channels are at least this (of [-1, 1]) a view shows background, or its edge.
+const WHITE: f32 = 0.9;
+
+/// What came of a search.
+pub struct Outcome<L> {
+    /// What was searched for.
+    pub shot: Shot,
+    /// What was found of it.
+    pub found: Found,
+    /// What whoever searches remembers of it.
+    pub log: L,
+}
+
+/// How photographs are looked at and searched for. What goes wrong in what is called is handed on as it is.
+pub struct Boxed<'a, E> {
+    /// What renders views.
+    pub engine: &'a Engine,
+    /// The model that knows the objects.
+    pub model: &'a Model,
+    /// The object in the photograph with this number, cut out by its box and what is known of it.
+    pub open: &'a dyn Fn(usize, Known) -> Result<Shot, E>,
+    /// Where searches start.
+    pub starts: StartsOf<'a, E>,
+}
+
+/// Where a search for the object in the photograph with this number starts.
+pub type StartsOf<'a, E> = &'a dyn Fn(usize, &Shot) -> Result<Vec<DMat4>, E>;
+
+/// Searches for objects in the photographs with these numbers, each from its own starts.
+pub type Pass<'a, L, E> = &'a mut dyn FnMut(&[usize], Vec<Shot>, &[Vec<DMat4>]) -> Result<Vec<Outcome<L>>, E>;
+
+impl<E: From<Error>> Boxed<'_, E> {
+    /// Searches for objects in the photographs with these numbers, that were cut out by their boxes alone, then from where these end, cut out anew by the model's view from there. Where that is not to be
+    /// trusted it begins once more with the colours of the model's object; what leaves less unexplained counts.
+    pub fn search<L>(&self, numbers: &[usize], shots: Vec<Shot>, pass: Pass<L, E>) -> Result<Vec<Outcome<L>>, E> {
+        let mut outcomes = self.in_turns(numbers, shots, pass)?;
+        let (mut lost, mut anew) = (Vec::new(), Vec::new());
+        for (i, Outcome { shot, .. }) in outcomes.iter().enumerate().filter(|(_, outcome)| !outcome.found.is_trusted()) {
+            let colours = self.colours(shot.instance)?;
+            // Nothing in the box may have those colours.
+            if let Ok(shot) = (self.open)(numbers[i], Known { colours: &colours, place: None }) {
+                lost.push(i);
+                anew.push(shot);
+            }
+        }
+        if lost.is_empty() {
+            return Ok(outcomes);
+        }
+        let again = self.in_turns(&lost.iter().map(|&i| numbers[i]).collect::<Vec<_>>(), anew, pass)?;
+        for (i, mut other) in lost.into_iter().zip(again) {
+            let seconds = outcomes[i].found.seconds + other.found.seconds;
+            if other.found.is_trusted() || other.found.unexplained < outcomes[i].found.unexplained {
+                std::mem::swap(&mut outcomes[i], &mut other);
+            }
+            outcomes[i].found.seconds = seconds;
+        }
+        Ok(outcomes)
+    }
+
+    /// A search, and one from where it ends.
+    fn in_turns<L>(&self, numbers: &[usize], shots: Vec<Shot>, pass: Pass<L, E>) -> Result<Vec<Outcome<L>>, E> {
+        let starts = numbers.iter().zip(&shots).map(|(&number, shot)| (self.starts)(number, shot));
+        let starts = starts.collect::<Result<Vec<_>, E>>()?;
+        let first = pass(numbers, shots, &starts)?;
+        let mut anew = Vec::new();
+        for (&number, Outcome { shot, found, .. }) in numbers.iter().zip(&first) {
+            let object = FoundObject::of(shot, &found.world_from_camera, self.engine, self.model, 1)?;
+            let cut = (self.open)(number, Known { colours: &[], place: Some(&|at| object.shows(at)) });
+            // Or nothing, where the pose is far off.
+            anew.push(cut.unwrap_or_else(|_| shot.clone()));
+        }
+        let near: Vec<_> = first.iter().map(|outcome| neighbor4(&outcome.found.world_from_camera)).collect();
+        let mut second = pass(numbers, anew, &near)?;
+        second.iter_mut().zip(first).for_each(|(second, first)| second.found.seconds += first.found.seconds);
+        Ok(second)
+    }
+
+    /// Those of the model's object, from all around.
+    fn colours(&self, instance: u32) -> Result<Vec<[f32; 3]>, E> {
+        let radius = self.model.metadata.orbit_radius.unwrap_or(1.3);
+        // So that the object fills the picture.
+        let focal = f64::from(SIDE) * radius;
+        let middle = 0.5 * f64::from(SIDE);
+        let camera = Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.5 };
+        let views: Vec<View> = fixed24(radius).into_iter().map(|pose| (instance, pose, camera)).collect();
+        let renders = render_views(self.engine, self.model, [SIDE; 2], &views)?;
+        let pixels = renders.iter().flat_map(|render| render.rgb.chunks_exact(3)).map(|c| [c[0], c[1], c[2]]);
+        Ok(pixels.filter(|colour| colour.iter().any(|&c| c < WHITE)).collect())
+    }
+}
