@@ -8,8 +8,9 @@ const CRATES: &[(&str, &str, &[&str])] = &[
     ("crates/plan", "srn-plan", &["srn-shaders"]),
     ("crates/cpu", "srn-cpu", &["srn-plan", "srn-shaders"]),
     ("crates/gpu", "srn-gpu", &["srn-plan", "srn-shaders"]),
-    ("crates/data", "srn-data", &[]),
-    ("crates/sigma-srn", "sigma-srn", &["srn-plan", "srn-cpu", "srn-gpu", "srn-shaders"]),
+    ("crates/photo", "srn-photo", &[]),
+    ("crates/data", "srn-data", &["srn-photo"]),
+    ("crates/sigma-srn", "sigma-srn", &["srn-photo", "srn-plan", "srn-cpu", "srn-gpu", "srn-shaders"]),
     // From the GPU crate only the rasteriser.
     ("crates/cli", "sigma-cli", &["sigma-srn", "srn-data", "srn-gpu"]),
     ("crates/web", "sigma-web", &["sigma-srn"]),

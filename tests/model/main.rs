@@ -12,6 +12,7 @@ mod cooperative;
 mod finite_differences;
 mod golden;
 mod lockstep;
+mod photo;
 mod proof;
 mod streamed;
 mod tiles;

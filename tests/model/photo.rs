@@ -1,0 +1,52 @@
+//! Photographs whose objects nobody has cut out.
+
+use std::path::Path;
+
+use sigma_srn::photo::{BoundingBox, FoundObject, Photo, Shot};
+use sigma_srn::{Effort, Engine, Error, Found, Intrinsics, Model, Search, camera};
+
+/// Of the pictures in `assets/scenes`.
+const INTRINSICS: Intrinsics = Intrinsics { fx: 297.6, fy: 297.6, cx: 128.0, cy: 128.0, pixel_center: 0.0 };
+const FORKLIFT: BoundingBox = BoundingBox { corner: [35.0, 64.0], size: [194.0, 130.0] };
+
+fn search(photo: &Photo, intrinsics: &Intrinsics, bounds: BoundingBox) -> Result<(Shot, Found, FoundObject), Error> {
+    let model = Model::load(Path::new("../assets/models/compact.safetensors")).unwrap();
+    let engine = Engine::cpu();
+    let starts = |shot: &Shot| shot.around(&model, camera::around2016, None);
+    let (search, instance) = (Search::of(Effort::Fast), model.instance("forklift").unwrap());
+    let (shot, found) = search.run_in_box(&engine, &model, instance, (photo, intrinsics), bounds, starts, |_| Ok(()))?;
+    let object = FoundObject::of(&shot, &found.world_from_camera, &engine, &model, 1)?;
+    Ok((shot, found, object))
+}
+
+fn scene() -> Photo {
+    let picture = image::open("../assets/scenes/forklift.png").unwrap().to_rgba8();
+    Photo::from_rgba8(picture.width() as usize, picture.height() as usize, &picture).unwrap()
+}
+
+/// Among others, nothing known of its pose; whatever place of a pixel intrinsics count from.
+#[test]
+fn an_object_is_found_in_a_box() {
+    let truth = srn_data::srn::read_pose(Path::new("../assets/scenes/forklift.txt")).unwrap();
+    let opengl = Intrinsics { cx: 128.5, cy: 128.5, pixel_center: 0.5, ..INTRINSICS };
+    let [(shot, found, object), (other, ..)] =
+        [INTRINSICS, opengl].map(|intrinsics| search(&scene(), &intrinsics, FORKLIFT).unwrap());
+    assert_eq!((shot.rgb, shot.intrinsics), (other.rgb, other.intrinsics));
+    let (angle, distance) = camera::pose_error(&found.world_from_camera, &truth);
+    // 0.2° and 0.005 here.
+    assert!(angle < 0.6 && distance < 0.015 && found.is_trusted(), "{angle} {distance} {:?}", found.doubt);
+    let bounds = object.bounds().unwrap();
+    for k in 0..2 {
+        let ends = [bounds.corner[k] - FORKLIFT.corner[k], bounds.size[k] - FORKLIFT.size[k]];
+        assert!(ends.iter().all(|off| off.abs() < 8.0), "{bounds:?}");
+    }
+    // Its forks do not fill the box, nor does it cover what lies outside.
+    assert!(object.covers([150.0, 150.0]) && !object.covers([50.0, 80.0]) && !object.covers([150.0, 20.0]));
+}
+
+#[test]
+fn a_box_with_nothing_in_it_is_named() {
+    let outside = BoundingBox { corner: [300.0, 10.0], ..FORKLIFT };
+    let error = search(&scene(), &INTRINSICS, outside).map(|_| ()).unwrap_err().to_string();
+    assert!(error.contains("300") && error.contains("nothing in it"), "{error}");
+}
