@@ -882,6 +882,22 @@ fn a_box_around_the_object_is_enough() {
     let off = found["error"]["rotation_deg"].as_f64().unwrap();
     assert!(off < 1.5 && found["trusted"] == true && found["within_95"] == true, "{found}");
     assert_eq!(files(&dir.join("out")), ["seat-photo-outline.png", "seat-photo.gif", "seat-photo.png"]);
+
+    // Of several pictures one in which nothing is in the box is told, in its place; the others are found as alone.
+    image::RgbImage::from_pixel(160, 128, image::Rgb([120, 92, 70])).save(dir.join("table.png")).unwrap();
+    let found_alone = found["world_from_camera"].clone();
+    let several = format!("estimate table.png photo.png table.png {given} {args} --record out --force");
+    let all = json(&run(dir, &several, 1))["images"].take();
+    assert_eq!(all[1]["world_from_camera"], found_alone);
+    for (i, image) in ["table.png", "photo.png", "table.png"].iter().enumerate() {
+        let failure = all[i]["failure"].as_str().unwrap_or_default();
+        assert!(all[i]["image"] == *image && failure.contains("box") == (*image == "table.png"), "{}", all[i]);
+        assert_eq!(all[i]["trusted"], *image == "photo.png");
+    }
+    let text = run(dir, &several.replace("--json", ""), 1);
+    let lines: Vec<&str> = text.lines().collect();
+    assert!(lines.len() == 3 && lines[0].starts_with("table.png  DO NOT TRUST: ") && lines[1].starts_with("photo.png  seat"));
+    fail(dir, &format!("estimate table.png table.png {given} {args}"), &["table.png", "box"]);
 }
 
 /// The seat goes to the right; once something is before the whole camera, and once before the seat.

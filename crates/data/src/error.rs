@@ -33,6 +33,18 @@ pub enum Error {
         /// What is there.
         found: String,
     },
+    /// Of a picture in which no object is.
+    #[error("{}: {field}: expected {expected}, found {found}", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+        /// What says where the object is.
+        field: String,
+        /// What was expected.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
     /// A file that must exist does not.
     #[error("{}: missing: {why}", path.display())]
     Missing {

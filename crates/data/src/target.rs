@@ -49,13 +49,11 @@ pub fn of_photo(
     if let Some(mask) = mask {
         photo.mask(counts(mask, size)?);
     }
-    photo.square(whole(path, intrinsics, size)?, side).ok_or_else(|| {
-        Error::field(
-            mask.or(if let Some(Cutout::Mask(mask)) = cutout { Some(mask) } else { None }).unwrap_or(path),
-            "mask",
-            "white, or opaque, where the object is",
-            format!("nothing of it, at most {:.0} of 255", 255.0 * photo.most_shown()),
-        )
+    photo.square(whole(path, intrinsics, size)?, side).ok_or_else(|| Error::Empty {
+        path: mask.or(if let Some(Cutout::Mask(mask)) = cutout { Some(mask) } else { None }).unwrap_or(path).into(),
+        field: "mask".into(),
+        expected: "white, or opaque, where the object is".into(),
+        found: format!("nothing of it, at most {:.0} of 255", 255.0 * photo.most_shown()),
     })
 }
 
@@ -76,12 +74,12 @@ fn nothing_in(
     BoundingBox { corner: [x, y], size: [width, height] }: BoundingBox,
     [across, down]: [usize; 2],
 ) -> Error {
-    Error::field(
-        path,
-        format!("box {x},{y},{width},{height}"),
-        format!("an object in its {across}×{down} pixels, and some of what is around it"),
-        "nothing that differs from what is around it, or nothing around it",
-    )
+    Error::Empty {
+        path: path.into(),
+        field: format!("box {x},{y},{width},{height}"),
+        expected: format!("an object in its {across}×{down} pixels, and some of what is around it"),
+        found: "nothing that differs from what is around it, or nothing around it".into(),
+    }
 }
 
 /// A mask as numbers from 0 to 1.

@@ -30,7 +30,8 @@ const AT_ONCE: usize = 32;
 #[derive(Args, Debug)]
 pub struct Estimate {
     /// Pictures (PNG, JPEG, BMP, TIFF, WebP) of any size and colour type; transparency becomes white. A photograph that lies in no SRN folder is cut to a square
-    /// around what transparency, --cutout and --mask leave of it; with neither, to its middle. Several are searched for side by side, 32 at a time.
+    /// around what transparency, --cutout and --mask leave of it; with neither, to its middle. Several are searched for side by side, 32 at a time; those of
+    /// them in which no object is, as a box or a mask has it, are told.
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
     #[command(flatten)]
@@ -96,7 +97,23 @@ struct Report {
     seconds: f64,
     /// Axes of the cameras in all poses.
     convention: Axes,
-    images: Vec<ImageReport>,
+    images: Vec<Entry>,
+}
+
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Entry {
+    Found(Box<ImageReport>),
+    Failed(Failed),
+}
+
+/// One of several pictures in which no object is.
+#[derive(Serialize)]
+struct Failed {
+    #[serde(serialize_with = "lossy")]
+    image: PathBuf,
+    trusted: bool,
+    failure: String,
 }
 
 #[derive(Serialize)]
@@ -167,7 +184,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let side = model_side(&model, &args.images[0])?;
     let notation = args.poses.open()?;
     let rough = poses("--rough", &args.rough, &args.images, &notation)?;
-    let pictures = pictures(args, &model, side, &notation)?;
+    let (pictures, numbers, failures) = pictures(args, &model, side, &notation)?;
     let sources = args.images.iter().map(|path| args.poses.source(srn_instance(path).as_deref())).collect::<Result<Vec<_>>>()?;
     let default = if !args.rough.is_empty() {
         Starts::Neighbor4
@@ -182,8 +199,8 @@ pub fn run(args: &Estimate) -> Result<bool> {
         return Err(format!("--rough is what --starts neighbor4 turns; {starts} does without it").into());
     }
     let starts_of = |number: usize, shot: &Shot| args.search.starts(starts, &model, shot, rough[number].as_ref(), &notation);
-    let starts =
-        pictures.iter().enumerate().map(|(number, picture)| starts_of(number, &picture.shot)).collect::<Result<Vec<_>>>()?;
+    let starts = numbers.iter().zip(&pictures).map(|(&number, picture)| starts_of(number, &picture.shot));
+    let starts = starts.collect::<Result<Vec<_>>>()?;
     if let Some(dir) = &args.record {
         let of = |end: &'static str| pictures.iter().map(move |p| dir.join(format!("{}{end}", p.name)));
         let files = [".png", ".gif", "-outline.png"].into_iter().flat_map(of);
@@ -192,7 +209,7 @@ pub fn run(args: &Estimate) -> Result<bool> {
     }
     if let Some(path) = &args.save_model {
         // Not by clap, whose `requires` is silent where something else conflicts with what is required.
-        if !args.unseen || pictures.len() > 1 {
+        if !args.unseen || args.images.len() > 1 {
             return Err("--save-model is for --unseen and one picture".into());
         }
         refuse_to_write(path, args.force)?;
@@ -200,7 +217,8 @@ pub fn run(args: &Estimate) -> Result<bool> {
     let saved = args.save_views.as_ref().map(|dir| SavedViews::create(dir, &model, &pictures, args.force)).transpose()?;
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
-    let mut output = Output { args, on, notation: &notation, pictures: &pictures, sources: &sources, images: vec![] };
+    let (pictures, numbers) = (&pictures[..], &numbers[..]);
+    let mut output = Output { args, on, notation: &notation, pictures, numbers, sources: &sources, failures, images: vec![] };
     let done = if args.unseen { unseen(&starts, &mut output) } else { searched(&starts_of, saved, &mut output) };
     // Poses that were found are told, also where a picture of them could not be written.
     if done.is_err() && output.images.is_empty() {
@@ -216,7 +234,7 @@ fn searched(
     mut saved: Option<SavedViews>,
     output: &mut Output,
 ) -> Result<()> {
-    let &mut Output { args, on, pictures: all, .. } = output;
+    let &mut Output { args, on, pictures: all, numbers: given, .. } = output;
     let is_boxed = !args.boxes.is_empty();
     let settings = if is_boxed { args.search.single(args.search.options()?) } else { args.search.search()? };
     let bar = progress::bar(0, "steps");
@@ -243,15 +261,16 @@ fn searched(
         let numbers: Vec<usize> = (first..all.len()).take(AT_ONCE).collect();
         let pictures = &all[first..][..numbers.len()];
         let outcomes = if is_boxed {
-            let open = |number: usize, known: Known| Ok(opened(args, on.model, on.side, number, known)?.shot);
-            let boxed = Boxed { engine: on.engine, model: on.model, open: &open, starts: starts_of };
+            let open = |i: usize, known: Known| Ok(opened(args, on.model, on.side, given[i], known)?.shot);
+            let starts = |i: usize, shot: &Shot| starts_of(given[i], shot);
+            let boxed = Boxed { engine: on.engine, model: on.model, open: &open, starts: &starts };
             let shots = pictures.iter().map(|picture| picture.shot.clone()).collect();
             boxed.search(&numbers, shots, &mut |numbers: &[usize], shots, starts: &[_]| {
                 let named = |(&number, shot): (&usize, _)| Picture { shot, ..all[number].clone() };
                 pass(&numbers.iter().zip(shots).map(named).collect::<Vec<_>>(), starts)
             })?
         } else {
-            let starts = numbers.iter().zip(pictures).map(|(&number, picture)| starts_of(number, &picture.shot));
+            let starts = numbers.iter().zip(pictures).map(|(&i, picture)| starts_of(given[i], &picture.shot));
             let starts = starts.collect::<Result<Vec<_>>>()?;
             pass(pictures, &starts)?
         };
@@ -264,7 +283,7 @@ fn searched(
         if let Some(dir) = &args.record {
             for ((number, picture), Outcome { found, log: (log, i), .. }) in numbers.into_iter().zip(&pictures).zip(&outcomes) {
                 log.write(dir, *i, picture, found, on)?;
-                outline::write(dir, &args.images[number], picture, found, on)?;
+                outline::write(dir, &args.images[given[number]], picture, found, on)?;
             }
         }
     }
@@ -276,7 +295,8 @@ fn searched(
         let (written, all) = (saved.finish()?, all.len());
         eprintln!("{written} of {all} pictures, those with poses to be trusted, written to {}", dir.display());
     }
-    if args.cutout.is_empty() && !is_boxed && output.images.iter().any(|image| image.doubt == Some(Doubt::Hidden)) {
+    let is_hidden = |entry: &Entry| matches!(entry, Entry::Found(image) if image.doubt == Some(Doubt::Hidden));
+    if args.cutout.is_empty() && !is_boxed && output.images.iter().any(is_hidden) {
         eprintln!("--mask says nothing of what it hides; a segmentation of the object is for --cutout, and its outline counts");
     }
     Ok(())
@@ -315,21 +335,36 @@ fn poses(flag: &str, sources: &[PoseSource], images: &[PathBuf], notation: &Nota
     each(flag, "poses", sources, images)?.into_iter().map(read).collect()
 }
 
-fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> Result<Vec<Picture>> {
+/// The pictures with their numbers among those that were given; and of several those in which no object is, with why.
+type Opened = (Vec<Picture>, Vec<usize>, Vec<(usize, String)>);
+
+fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> Result<Opened> {
     let truths = poses("--truth", &args.truth, &args.images, notation)?;
     each("--cutout", "masks", &args.cutout, &args.images)?;
     each("--mask", "masks", &args.mask, &args.images)?;
     each("--box", "boxes", &args.boxes, &args.images)?;
-    let (mut names, mut pictures) = (HashSet::new(), Vec::new());
+    let (mut names, mut pictures, mut numbers, mut failures) = (HashSet::new(), Vec::new(), Vec::new(), Vec::new());
     for (number, (path, truth)) in args.images.iter().zip(truths).enumerate() {
         warn_of_turned(path);
-        let mut picture = Picture { truth, ..opened(args, model, side, number, Known::default())? };
+        let mut picture = match opened(args, model, side, number, Known::default()) {
+            Ok(picture) => Picture { truth, ..picture },
+            // A detector may see what is not there, which says nothing of the other pictures.
+            Err(error) if args.images.len() > 1 && matches!(error.downcast_ref(), Some(srn_data::Error::Empty { .. })) => {
+                failures.push((number, error.to_string()));
+                continue;
+            }
+            Err(error) => return Err(error),
+        };
         while !names.insert(picture.name.clone()) {
             picture.name += "-again";
         }
         pictures.push(picture);
+        numbers.push(number);
     }
-    Ok(pictures)
+    match failures.first() {
+        Some((_, failure)) if pictures.is_empty() => Err(failure.as_str().into()),
+        _ => Ok((pictures, numbers, failures)),
+    }
 }
 
 /// A picture with what is said of it; if by a box, with what is `known` of the object in it.
@@ -352,28 +387,49 @@ struct Output<'a> {
     on: On<'a>,
     notation: &'a Notation,
     pictures: &'a [Picture],
+    /// Their numbers among those that were given.
+    numbers: &'a [usize],
     sources: &'a [Option<Notation>],
-    images: Vec<ImageReport>,
+    /// Of pictures in which no object is.
+    failures: Vec<(usize, String)>,
+    images: Vec<Entry>,
 }
 
 impl Output<'_> {
     /// Takes what was found of the next picture, and prints it, unless all is to be one JSON document.
     fn add(&mut self, picture: &Picture, instance: String, found: &Found, starts: usize, bar: &ProgressBar) -> Result<()> {
-        let image = self.image(picture, instance, found);
+        let number = self.numbers[self.images.iter().filter(|entry| matches!(entry, Entry::Found(_))).count()];
+        bar.suspend(|| self.fail(number))?;
+        let image = self.image(number, picture, instance, found);
         if !self.args.json {
             bar.suspend(|| print(&image.line(found, starts, self.notation)))?;
         }
-        self.images.push(image);
+        self.images.push(Entry::Found(Box::new(image)));
+        Ok(())
+    }
+
+    /// Tells of those pictures before this number in which no object is.
+    fn fail(&mut self, before: usize) -> Result<()> {
+        let count = self.failures.iter().take_while(|(number, _)| *number < before).count();
+        for (number, failure) in self.failures.drain(..count) {
+            let image = self.args.images[number].clone();
+            if !self.args.json {
+                print(&format!("{}  DO NOT TRUST: {failure}", image.display()))?;
+            }
+            self.images.push(Entry::Failed(Failed { image, trusted: false, failure }));
+        }
         Ok(())
     }
 
     /// Prints the document, if there is to be one; whether all poses are to be trusted.
-    fn end(self) -> Result<bool> {
-        let is_trusted = self.images.iter().all(|image| image.trusted);
+    fn end(mut self) -> Result<bool> {
+        self.fail(usize::MAX)?;
+        let is_trusted = self.images.iter().all(|entry| matches!(entry, Entry::Found(image) if image.trusted));
+        let seconds = |entry: &Entry| if let Entry::Found(image) = entry { image.seconds } else { 0.0 };
         if self.args.json {
             let report = Report {
                 executor: self.on.engine.to_string(),
-                seconds: self.images.iter().map(|image| image.seconds).sum(),
+                seconds: self.images.iter().map(seconds).sum(),
                 convention: self.args.poses.convention,
                 images: self.images,
             };
@@ -382,8 +438,8 @@ impl Output<'_> {
         Ok(is_trusted)
     }
 
-    fn image(&self, picture: &Picture, instance: String, found: &Found) -> ImageReport {
-        let (k, convention) = (self.images.len(), self.args.poses.convention);
+    fn image(&self, number: usize, picture: &Picture, instance: String, found: &Found) -> ImageReport {
+        let convention = self.args.poses.convention;
         let world_from_camera = convention.of_ours(found.world_from_camera);
         let [a, b, c, x, y, z] = Pose6::from_matrix(&world_from_camera).0;
         let error = |pose: &DMat4| picture.truth.map(|truth| PoseError::of(pose, &truth));
@@ -401,11 +457,11 @@ impl Output<'_> {
             world_from_camera: convention.of_ours(r.pose.to_matrix()).transpose().to_cols_array_2d(),
         };
         ImageReport {
-            image: self.args.images[k].clone(),
+            image: self.args.images[number].clone(),
             instance,
             world_from_camera: world_from_camera.transpose().to_cols_array_2d(),
-            source_from_camera: self.sources[k].map(|source| source.rows(&found.world_from_camera)),
-            camera_from_object: self.sources[k]
+            source_from_camera: self.sources[number].map(|source| source.rows(&found.world_from_camera)),
+            camera_from_object: self.sources[number]
                 .as_ref()
                 .unwrap_or(self.notation)
                 .object(&found.world_from_camera, found.confidence),

@@ -177,7 +177,8 @@ impl Picture {
             _ => target::of_photo(path, cutout, mask.as_deref(), &intrinsics, side as usize)?,
         };
         if square.rgb.iter().all(|&colour| colour >= WHITE) {
-            return Err(about("nothing but white: no object is in it").into());
+            let (field, expected) = ("pixels".into(), "an object".into());
+            return Err(srn_data::Error::Empty { path: path.into(), field, expected, found: "nothing but white".into() }.into());
         }
         let name = format!("{}-{stem}", model.instance_name(instance));
         Ok(Picture { name, truth: None, shot: Shot::of(square, instance) })
