@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use glam::DMat4;
 use serde::Serialize;
-use sigma_srn::confidence::{self, Matrix6, UNEXPLAINED, fit, motion, unexplained};
+use sigma_srn::confidence::{self, LEAST_UNEXPLAINED, Matrix6, UNEXPLAINED, fit, motion, unexplained};
 use sigma_srn::{Calibration, Effort, Found, Metadata, Options, Rendering, Seen, View};
 
 use super::files::Picture;
@@ -31,6 +31,8 @@ const FAR_DEG: f64 = 90.0;
 const LOST_WEIGHT: f64 = 0.25;
 /// Searches of which 95 % are not all: with fewer the largest error of them says where the others end.
 const ENOUGH: usize = 19;
+/// How many times what half of the few found poses of an object leave unexplained those to come may leave (`docs/accuracy.md`).
+const ABOVE_USUAL: f64 = 2.0;
 /// Values of each limit that are tried, at most.
 const CANDIDATES: usize = 64;
 
@@ -300,18 +302,23 @@ fn calibration(known: &[Known], lost: &[Known], at_truth: BTreeMap<String, f64>)
     };
     let (curvature, floor, sizes) = fit(&found().filter_map(error).collect::<Vec<_>>())?;
     let Limits { mut unexplained, above_truth, rival } = limits(known, lost);
-    // Few say no more of what wrong poses leave than a model without a calibration knows.
+    // Few say no more of what wrong poses leave than a model without a calibration knows, and one of them may be no measure: by a mask that is wrong, say.
     if found().count() < ENOUGH {
+        let mut of_each: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+        found().for_each(|known| of_each.entry(&known.instance).or_default().push(known.unexplained));
+        let usual = of_each.into_values().map(median).fold(0.0, f64::max);
         let most = found().map(|known| known.unexplained).fold(UNEXPLAINED, f64::max);
-        unexplained = unexplained.min(most);
+        unexplained = unexplained.min((ABOVE_USUAL * usual).clamp(LEAST_UNEXPLAINED, most));
     }
-    let median = |of: fn(&Seen) -> f64| {
-        let mut values: Vec<f64> = found().map(|known| of(&known.seen)).collect();
-        values.sort_by(f64::total_cmp);
-        values[values.len() / 2]
-    };
-    let seen = Some(Seen { distance: median(|seen| seen.distance), extent: median(|seen| seen.extent) });
+    let usual = |of: fn(&Seen) -> f64| median(found().map(|known| of(&known.seen)).collect());
+    let seen = Some(Seen { distance: usual(|seen| seen.distance), extent: usual(|seen| seen.extent) });
     Some(Calibration { curvature, floor, sizes, unexplained, at_truth, above_truth, rival, views: known.len() as u32, seen })
+}
+
+/// Of at least one.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
 }
 
 /// What an estimate to be trusted keeps to, see [`Calibration`].
@@ -419,11 +426,18 @@ mod tests {
     fn without_failures_the_limits_are_loose() {
         let views: Vec<Known> = (1..=9).map(|k| known(1.0, 0.01 * f64::from(k), f64::INFINITY)).collect();
         let found = calibration(&views, &[], BTreeMap::new()).unwrap();
-        assert!((found.unexplained - 0.135).abs() < 1e-12 && found.rival == 0.0 && found.views == 9, "{found:?}");
+        assert!(found.unexplained == LEAST_UNEXPLAINED && found.rival == 0.0 && found.views == 9, "{found:?}");
         assert_eq!(calibration(&[known(90.0, 0.1, 1.0)], &[], BTreeMap::new()), None);
         // But few views do not make them looser than those of a model that is not calibrated.
         let all = |count: usize| calibration(&vec![known(1.0, 0.2, f64::INFINITY); count], &[], BTreeMap::new()).unwrap();
         assert!((all(19).unexplained - 0.3).abs() < 1e-12 && all(18).unexplained == UNEXPLAINED);
+        // Nor does one of them that leaves much, as with a wrong mask; but an object that is known badly is.
+        let mut eight = vec![known(1.0, 0.1, f64::INFINITY); 7];
+        eight.push(known(1.0, 0.23, f64::INFINITY));
+        let limit = |views: &[Known]| calibration(views, &[], BTreeMap::new()).unwrap().unexplained;
+        assert_eq!(limit(&eight), 0.2);
+        eight.extend(vec![Known { instance: "stool".into(), ..known(1.0, 0.4, f64::INFINITY) }; 3]);
+        assert_eq!(limit(&eight), 0.4);
     }
 
     #[test]

@@ -44,7 +44,7 @@ impl std::fmt::Display for Doubt {
 /// What a picture may leave unexplained where there is no calibration.
 pub const UNEXPLAINED: f64 = 0.25;
 /// What it may leave there in any case: as little tells no wrong pose from a mask that is not exact.
-const LEAST_UNEXPLAINED: f64 = 0.12;
+pub const LEAST_UNEXPLAINED: f64 = 0.12;
 /// How many times that what pictures of the object leave that its training has looked at, see [`Metadata::unexplained`] (`docs/accuracy.md`).
 const ABOVE_LEARNT: f64 = 1.6;
 /// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on, or that is partly hidden (`docs/accuracy.md`).

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 pub(crate) use self::deviation::promise;
 pub use self::deviation::{Confidence, Known, Matrix6, WITHIN_95, fit, motion};
-pub use self::doubt::{Doubt, UNEXPLAINED, unexplained, unexplained_doubt};
+pub use self::doubt::{Doubt, LEAST_UNEXPLAINED, UNEXPLAINED, unexplained, unexplained_doubt};
 pub(crate) use self::doubt::{explains_colours, hidden_doubt};
 
 /// What estimates of known poses told of a model.
