@@ -327,6 +327,50 @@ fn frames_come_on_stdin() {
     assert_eq!(frames_of(&home.path().join("frames.gif")), 2);
 }
 
+/// A detector beside a camera names pictures, objects and boxes, and gets an answer to each.
+#[test]
+fn pictures_and_what_is_said_of_them_come_on_stdin() {
+    let home = TempDir::new().unwrap();
+    let dir = home.path();
+    let bounds = on_a_table([50, 30], &dir.join("photo.png"));
+    fs::write(dir.join("camera.txt"), "74.4 82 62 0.\n0. 0. 0.\n1.\n128 160\n").unwrap();
+    let args = format!("estimate - --model {SHIPPED} --executor cpu --effort fast --intrinsics camera.txt");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sigma-pose"));
+    command
+        .current_dir(dir)
+        .args(args.split(' '))
+        .arg("--json")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
+    let mut child = command.spawn().unwrap();
+    let (mut asked, mut told) = (child.stdin.take().unwrap(), BufReader::new(child.stdout.take().unwrap()).lines());
+    let mut ask = |line: &str| -> Value {
+        writeln!(asked, "{line}\n").unwrap();
+        serde_json::from_str(&told.next().unwrap().unwrap()).unwrap()
+    };
+    let found = ask(&format!(r#"{{"image": "photo.png", "instance": "seat", "box": [{bounds}]}}"#));
+    assert!(found["trusted"] == true && found["instance"] == "seat" && found["image"] == "photo.png", "{found}");
+    let rough = &found["world_from_camera"];
+    let again = ask(&format!(r#"{{"image": "photo.png", "instance": "seat", "box": [{bounds}], "rough": {rough}}}"#));
+    let at = |found: &Value, k: usize| found["world_from_camera"][k][3].as_f64().unwrap();
+    assert!((0..3).all(|k| (at(&found, k) - at(&again, k)).abs() < 0.02), "{found} {again}");
+    for (line, said) in [
+        (r#"{"image": "photo.png", "instance": "seat", "box": [500, 500, 9, 9]}"#, "box 500"),
+        (r#"{"image": "photo.png", "instance": "stool"}"#, "stool"),
+        (r#"{"image": "photo.png", "where": 1}"#, "where"),
+        ("no-such.png", "no-such.png"),
+    ] {
+        let answer = ask(line);
+        assert!(answer["trusted"] == false && answer["failure"].as_str().unwrap().contains(said), "{answer}");
+    }
+    // Another object's pose is found, but not trusted.
+    assert!(ask(&format!(r#"{{"image": "photo.png", "instance": "valve", "box": [{bounds}]}}"#))["doubt"].is_string());
+    drop(asked);
+    assert_eq!(child.wait().unwrap().code(), Some(1));
+    fail(dir, &format!("{args} --box {bounds}"), &["--box", "its line"]);
+}
+
 /// The tables of one instance: every preset and loss, all files, nothing overwritten.
 #[test]
 fn tables_hold_every_preset() {

@@ -231,7 +231,7 @@ pub fn read_poses(path: &Path) -> Result<Vec<DMat4>> {
 }
 
 /// Refuses what is no rigid motion.
-pub(crate) fn rigid(path: &Path, field: &str, pose: DMat4) -> Result<DMat4> {
+pub fn rigid(path: &Path, field: &str, pose: DMat4) -> Result<DMat4> {
     match rigid_error(&pose) {
         error if error <= RIGID_TOLERANCE && pose.w_axis.abs().max_element() <= LARGEST => Ok(pose),
         error if error <= RIGID_TOLERANCE => Err(Error::field(path, field, format!("a place within {LARGEST:e}"), pose.w_axis)),

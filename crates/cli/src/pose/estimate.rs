@@ -1,7 +1,7 @@
 //! `sigma-pose estimate`: poses of pictures.
 
 use std::collections::HashSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
 use clap::Args;
@@ -9,11 +9,13 @@ use glam::DMat4;
 use indicatif::ProgressBar;
 use serde::Serialize;
 use sigma_srn::photo::{BoundingBox, Boxed, Known, Outcome, Shot};
-use sigma_srn::{Confidence, Doubt, Found, Light, Model, Pose6};
+use sigma_srn::{Confidence, Doubt, Engine, Error, Found, Light, Model, Pose6, Progress, Search};
 use srn_data::camera::Axes;
-use srn_data::target::Cutout;
 
-use super::files::{Masks, ObjectArgs, Picture, PoseSource, bounding_box, model_side, srn_instance, warn_of_turned};
+use super::files::{
+    ObjectArgs, Picture, PoseSource, bounding_box, lines_on_stdin, model_side, path_of, srn_instance, warn_of_turned,
+};
+use super::given::Given;
 use super::mask::MadeRight;
 use super::notation::{Notation, NotationArgs, ObjectPose};
 use super::outline;
@@ -31,7 +33,9 @@ const AT_ONCE: usize = 32;
 pub struct Estimate {
     /// Pictures (PNG, JPEG, BMP, TIFF, WebP) of any size and colour type; transparency becomes white. A photograph that lies in no SRN folder is cut to a square
     /// around what transparency, --cutout and --mask leave of it; with neither, to its middle. Several are searched for side by side, 32 at a time; those of
-    /// them in which no object is, as a box or a mask has it, are told.
+    /// them in which no object is, as a box or a mask has it, are told. `-`: each line on stdin is a picture, whose pose is printed before the next one is read, with
+    /// `--json` in a line of its own: a path, or, with what flags say otherwise, JSON like {"image": "a.png", "instance": "seat", "box": [120, 80, 200, 160]}; also
+    /// `cutout`, `mask` and `rough` (4 × 4).
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
     #[command(flatten)]
@@ -110,6 +114,9 @@ enum Entry {
 /// One of several pictures in which no object is.
 #[derive(Serialize)]
 struct Failed {
+    /// Among those that were given.
+    #[serde(skip)]
+    number: usize,
     #[serde(serialize_with = "lossy")]
     image: PathBuf,
     trusted: bool,
@@ -175,34 +182,32 @@ struct RankedReport {
     error: Option<PoseError>,
 }
 
+/// A picture to search for, and where its poses are told, if it was imported.
+struct Asked {
+    /// Among those that were given.
+    number: usize,
+    given: Given,
+    picture: Picture,
+    source: Option<Notation>,
+}
+
 /// Runs the command; false where a pose is not to be trusted.
 pub fn run(args: &Estimate) -> Result<bool> {
     let model = load_model(&args.object.model)?;
     if args.unseen {
         model.hypernetwork().map_err(|error| about_model(&args.object.model, error))?;
     }
-    let side = model_side(&model, &args.images[0])?;
     let notation = args.poses.open()?;
-    let rough = poses("--rough", &args.rough, &args.images, &notation)?;
-    let (pictures, numbers, failures) = pictures(args, &model, side, &notation)?;
-    let sources = args.images.iter().map(|path| args.poses.source(srn_instance(path).as_deref())).collect::<Result<Vec<_>>>()?;
-    let default = if !args.rough.is_empty() {
-        Starts::Neighbor4
-    } else if args.unseen {
-        // As many as otherwise, for each known object, would take minutes.
-        Starts::Around84
-    } else {
-        args.search.all_around()
-    };
-    let starts = args.starts.as_ref().unwrap_or(&default);
-    if !args.rough.is_empty() && *starts != Starts::Neighbor4 {
-        return Err(format!("--rough is what --starts neighbor4 turns; {starts} does without it").into());
+    if args.images == [Path::new("-")] {
+        return on_stdin(args, &model, &notation);
     }
-    let starts_of = |number: usize, shot: &Shot| args.search.starts(starts, &model, shot, rough[number].as_ref(), &notation);
-    let starts = numbers.iter().zip(&pictures).map(|(&number, picture)| starts_of(number, &picture.shot));
-    let starts = starts.collect::<Result<Vec<_>>>()?;
+    let side = model_side(&model, &args.images[0])?;
+    let starts = starts(args, !args.rough.is_empty())?;
+    let (asked, failures) = pictures(args, &model, side, &notation)?;
+    let looking = Looking { args, model: &model, starts: &starts, notation: &notation };
+    let all = asked.iter().map(|asked| looking.starts_of(&asked.picture.shot, &asked.given)).collect::<Result<Vec<_>>>()?;
     if let Some(dir) = &args.record {
-        let of = |end: &'static str| pictures.iter().map(move |p| dir.join(format!("{}{end}", p.name)));
+        let of = |end: &'static str| asked.iter().map(move |asked| dir.join(format!("{}{end}", asked.picture.name)));
         let files = [".png", ".gif", "-outline.png"].into_iter().flat_map(of);
         refuse_existing(files, args.force)?;
         create_dir(dir)?;
@@ -214,12 +219,15 @@ pub fn run(args: &Estimate) -> Result<bool> {
         }
         refuse_to_write(path, args.force)?;
     }
-    let saved = args.save_views.as_ref().map(|dir| SavedViews::create(dir, &model, &pictures, args.force)).transpose()?;
+    let instances = asked.iter().map(|asked| asked.picture.shot.instance);
+    let saved = args.save_views.as_ref().map(|dir| SavedViews::create(dir, &model, instances, args.force)).transpose()?;
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
-    let (pictures, numbers) = (&pictures[..], &numbers[..]);
-    let mut output = Output { args, on, notation: &notation, pictures, numbers, sources: &sources, failures, images: vec![] };
-    let done = if args.unseen { unseen(&starts, &mut output) } else { searched(&starts_of, saved, &mut output) };
+    let mut output = Output { args, on, notation: &notation, failures, images: vec![] };
+    let done = match args.unseen {
+        true => unseen(&asked, &all, &mut output),
+        false => searched(&looking, &asked, saved, &mut output),
+    };
     // Poses that were found are told, also where a picture of them could not be written.
     if done.is_err() && output.images.is_empty() {
         return done.map(|()| false);
@@ -228,20 +236,99 @@ pub fn run(args: &Estimate) -> Result<bool> {
     done.map(|()| is_trusted)
 }
 
-/// Poses of pictures of objects in the model; `starts_of` a picture with this number.
-fn searched(
-    starts_of: &dyn Fn(usize, &Shot) -> Result<Vec<DMat4>>,
-    mut saved: Option<SavedViews>,
-    output: &mut Output,
-) -> Result<()> {
-    let &mut Output { args, on, pictures: all, numbers: given, .. } = output;
+/// Where searches start, as flags have it.
+fn starts(args: &Estimate, is_rough: bool) -> Result<Starts> {
+    let default = if is_rough {
+        Starts::Neighbor4
+    } else if args.unseen {
+        // As many as otherwise, for each known object, would take minutes.
+        Starts::Around84
+    } else {
+        args.search.all_around()
+    };
+    let starts = args.starts.clone().unwrap_or(default);
+    if is_rough && starts != Starts::Neighbor4 {
+        return Err(format!("--rough is what --starts neighbor4 turns; {starts} does without it").into());
+    }
+    Ok(starts)
+}
+
+/// How pictures are looked at.
+struct Looking<'a> {
+    args: &'a Estimate,
+    model: &'a Model,
+    starts: &'a Starts,
+    notation: &'a Notation,
+}
+
+/// What was noted of a search, and the number of a picture in there.
+type Noted = (Rc<Log>, usize);
+/// Searches for pictures as they stand, each from its own starts.
+type Pass<'a> = &'a mut dyn FnMut(&[Picture], &[Vec<DMat4>]) -> Result<Vec<Outcome<Noted>>>;
+
+impl Looking<'_> {
+    /// A picture; if it has a box, with what is `known` of the object in it.
+    fn open(&self, given: &Given, side: u32, known: Known) -> Result<Picture> {
+        // Of an object that the model does not know the number says nothing.
+        let any = self.args.unseen.then(|| self.model.instance_name(0));
+        let instance = any.as_deref().or(self.args.object.instance.as_deref());
+        given.open(self.model, side, instance, &self.args.object.camera, known)
+    }
+
+    fn starts_of(&self, shot: &Shot, given: &Given) -> Result<Vec<DMat4>> {
+        self.args.search.starts(self.starts, self.model, shot, given.rough.as_ref(), self.notation)
+    }
+
+    /// Searches for pictures, all of which have boxes, or none.
+    fn find(&self, on: On, asked: &[Asked], pass: Pass) -> Result<Vec<Outcome<Noted>>> {
+        if asked.iter().all(|asked| asked.given.bounds.is_none()) {
+            let starts = asked.iter().map(|Asked { picture, given, .. }| self.starts_of(&picture.shot, given));
+            let pictures: Vec<_> = asked.iter().map(|asked| asked.picture.clone()).collect();
+            return pass(&pictures, &starts.collect::<Result<Vec<_>>>()?);
+        }
+        let open = |i: usize, known: Known| Ok(self.open(&asked[i].given, on.side, known)?.shot);
+        let starts = |i: usize, shot: &Shot| self.starts_of(shot, &asked[i].given);
+        let boxed = Boxed { engine: on.engine, model: on.model, open: &open, starts: &starts };
+        let shots = asked.iter().map(|asked| asked.picture.shot.clone()).collect();
+        let numbers: Vec<usize> = (0..asked.len()).collect();
+        boxed.search(&numbers, shots, &mut |numbers: &[usize], shots, starts: &[_]| {
+            let named = |(&i, shot): (&usize, _)| Picture { shot, ..asked[i].picture.clone() };
+            pass(&numbers.iter().zip(shots).map(named).collect::<Vec<_>>(), starts)
+        })
+    }
+
+    /// The settings of a search; those of pictures with boxes follow one another as they do.
+    fn settings(&self, is_boxed: bool) -> Result<Search> {
+        let search = &self.args.search;
+        if is_boxed { Ok(search.single(search.options()?)) } else { search.search() }
+    }
+}
+
+/// Searches for pictures, and tells what was noted of each.
+fn pass(
+    settings: &Search,
+    on: On,
+    pictures: &[Picture],
+    starts: &[Vec<DMat4>],
+    mut observe: impl FnMut(&mut Log, Progress) -> std::result::Result<(), Error>,
+) -> Result<Vec<Outcome<Noted>>> {
+    let mut log = Log::default();
+    let found = search(settings, on, pictures, starts, |progress| observe(&mut log, progress))?;
+    let log = Rc::new(log);
+    let outcome =
+        |(i, (picture, found)): (_, (&Picture, _))| Outcome { shot: picture.shot.clone(), found, log: (log.clone(), i) };
+    Ok(pictures.iter().zip(found).enumerate().map(outcome).collect())
+}
+
+/// Poses of pictures of objects in the model.
+fn searched(looking: &Looking, all: &[Asked], mut saved: Option<SavedViews>, output: &mut Output) -> Result<()> {
+    let &mut Output { args, on, .. } = output;
     let is_boxed = !args.boxes.is_empty();
-    let settings = if is_boxed { args.search.single(args.search.options()?) } else { args.search.search()? };
+    let settings = looking.settings(is_boxed)?;
     let bar = progress::bar(0, "steps");
     let (mut left, mut before) = (all.len().div_ceil(AT_ONCE) as u64 * if is_boxed { 2 } else { 1 }, 0);
-    let mut pass = |pictures: &[Picture], starts: &[Vec<DMat4>]| -> Result<Vec<Outcome<_>>> {
-        let mut log = Log::default();
-        let found = search(&settings, on, pictures, starts, |mut progress| {
+    let mut pass = |pictures: &[Picture], starts: &[Vec<DMat4>]| {
+        let outcomes = pass(&settings, on, pictures, starts, |log, mut progress| {
             bar.set_length(before + left * u64::from(progress.steps));
             if progress.search > 0 && progress.step == 0 {
                 bar.set_message(format!("{}, once more", pictures[progress.hypotheses[0].0].name));
@@ -252,38 +339,20 @@ fn searched(
         // Pictures with boxes may need two more than was thought.
         (left, before) = ((left - 1).max(1), bar.position());
         bar.set_message("");
-        let log = Rc::new(log);
-        let outcome =
-            |(i, (picture, found)): (_, (&Picture, _))| Outcome { shot: picture.shot.clone(), found, log: (log.clone(), i) };
-        Ok(pictures.iter().zip(found).enumerate().map(outcome).collect())
+        Ok(outcomes)
     };
-    for first in (0..all.len()).step_by(AT_ONCE) {
-        let numbers: Vec<usize> = (first..all.len()).take(AT_ONCE).collect();
-        let pictures = &all[first..][..numbers.len()];
-        let outcomes = if is_boxed {
-            let open = |i: usize, known: Known| Ok(opened(args, on.model, on.side, given[i], known)?.shot);
-            let starts = |i: usize, shot: &Shot| starts_of(given[i], shot);
-            let boxed = Boxed { engine: on.engine, model: on.model, open: &open, starts: &starts };
-            let shots = pictures.iter().map(|picture| picture.shot.clone()).collect();
-            boxed.search(&numbers, shots, &mut |numbers: &[usize], shots, starts: &[_]| {
-                let named = |(&number, shot): (&usize, _)| Picture { shot, ..all[number].clone() };
-                pass(&numbers.iter().zip(shots).map(named).collect::<Vec<_>>(), starts)
-            })?
-        } else {
-            let starts = numbers.iter().zip(pictures).map(|(&i, picture)| starts_of(given[i], &picture.shot));
-            let starts = starts.collect::<Result<Vec<_>>>()?;
-            pass(pictures, &starts)?
-        };
-        let named = |(picture, outcome): (&Picture, &Outcome<_>)| Picture { shot: outcome.shot.clone(), ..picture.clone() };
-        let pictures: Vec<Picture> = pictures.iter().zip(&outcomes).map(named).collect();
-        for (picture, Outcome { found, .. }) in pictures.iter().zip(&outcomes) {
-            output.add(picture, on.model.instance_name(picture.shot.instance), found, found.estimate.ranking.len(), &bar)?;
+    for asked in all.chunks(AT_ONCE) {
+        let outcomes = looking.find(on, asked, &mut pass)?;
+        let named = |(asked, outcome): (&Asked, &Outcome<_>)| Picture { shot: outcome.shot.clone(), ..asked.picture.clone() };
+        let pictures: Vec<Picture> = asked.iter().zip(&outcomes).map(named).collect();
+        for ((asked, picture), Outcome { found, .. }) in asked.iter().zip(&pictures).zip(&outcomes) {
+            output.add(asked, picture, found, found.estimate.ranking.len(), &bar)?;
             saved.iter_mut().try_for_each(|saved| saved.add(picture, found, on.side))?;
         }
         if let Some(dir) = &args.record {
-            for ((number, picture), Outcome { found, log: (log, i), .. }) in numbers.into_iter().zip(&pictures).zip(&outcomes) {
+            for ((asked, picture), Outcome { found, log: (log, i), .. }) in asked.iter().zip(&pictures).zip(&outcomes) {
                 log.write(dir, *i, picture, found, on)?;
-                outline::write(dir, &args.images[given[number]], picture, found, on)?;
+                outline::write(dir, &asked.given.image, picture, found, on)?;
             }
         }
     }
@@ -303,23 +372,87 @@ fn searched(
 }
 
 /// Poses of objects that are not in the model.
-fn unseen(starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
-    let &mut Output { args, on, pictures, .. } = output;
+fn unseen(all: &[Asked], starts: &[Vec<DMat4>], output: &mut Output) -> Result<()> {
+    let &mut Output { args, on, .. } = output;
     let bar = progress::bar(0, "turns");
-    for (number, (picture, starts)) in pictures.iter().zip(starts).enumerate() {
+    for (i, (asked, starts)) in all.iter().zip(starts).enumerate() {
         let observe = |turn: usize, turns: usize| {
-            bar.set_length((turns * pictures.len()) as u64);
-            bar.set_position((turns * number + turn) as u64);
+            bar.set_length((turns * all.len()) as u64);
+            bar.set_position((turns * i + turn) as u64);
             Ok(())
         };
-        let (found, fitted) = args.search.run_unseen(on, picture, starts, observe)?;
-        output.add(picture, "unseen".into(), &found, starts.len(), &bar)?;
+        let (found, fitted) = args.search.run_unseen(on, &asked.picture, starts, observe)?;
+        output.add(asked, &asked.picture, &found, starts.len(), &bar)?;
         if let Some(path) = &args.save_model {
             fitted.save(path)?;
         }
     }
     bar.finish_and_clear();
     Ok(())
+}
+
+/// A pose for each line on stdin, before the next one is read. What is wrong with a line is told in its place.
+fn on_stdin(args: &Estimate, model: &Model, notation: &Notation) -> Result<bool> {
+    let said = [
+        ("--unseen", args.unseen),
+        ("--cutout", !args.cutout.is_empty()),
+        ("--box", !args.boxes.is_empty()),
+        ("--mask", !args.mask.is_empty()),
+        ("--rough", !args.rough.is_empty()),
+        ("--truth", !args.truth.is_empty()),
+        ("--record", args.record.is_some()),
+        ("--save-views", args.save_views.is_some()),
+    ];
+    if let Some((flag, _)) = said.iter().find(|(_, is_given)| *is_given) {
+        return Err(format!("{flag} does not go together with pictures on stdin: what is said of each stands in its line").into());
+    }
+    let engine = args.search.open(&args.engine)?;
+    let mut is_trusted = true;
+    for line in lines_on_stdin() {
+        let line = line?;
+        let given = Given::parse(&line, notation);
+        let image = given.as_ref().map_or_else(|_| path_of(&line), |given| given.image.clone());
+        let told = match given.and_then(|given| of_line(args, model, &engine, notation, given)) {
+            Ok((is_sure, told)) => {
+                is_trusted &= is_sure;
+                told
+            }
+            Err(error) => {
+                is_trusted = false;
+                let failed = Failed { number: 0, image, trusted: false, failure: error.to_string() };
+                if args.json { serde_json::to_string(&failed)? } else { failed.line() }
+            }
+        };
+        print(&told)?;
+    }
+    Ok(is_trusted)
+}
+
+/// Whether the pose of a picture is to be trusted, and all of it as it is printed.
+fn of_line(args: &Estimate, model: &Model, engine: &Engine, notation: &Notation, given: Given) -> Result<(bool, String)> {
+    let side = model_side(model, &given.image)?;
+    let on = On { engine, model, side };
+    let looking = Looking { args, model, starts: &starts(args, given.rough.is_some())?, notation };
+    warn_of_turned(&given.image);
+    let picture = looking.open(&given, side, Known::default())?;
+    let source = args.poses.source(srn_instance(&given.image).as_deref())?;
+    let settings = looking.settings(given.bounds.is_some())?;
+    let asked = Asked { number: 0, given, picture, source };
+    let bar = progress::bar(0, "steps");
+    let mut pass = |pictures: &[Picture], starts: &[Vec<DMat4>]| {
+        pass(&settings, on, pictures, starts, |_, progress| {
+            bar.set_length(progress.steps.into());
+            bar.set_position(progress.step.into());
+            Ok(())
+        })
+    };
+    let found = looking.find(on, std::slice::from_ref(&asked), &mut pass);
+    bar.finish_and_clear();
+    let Outcome { shot, found, .. } = found?.remove(0);
+    let picture = Picture { shot, ..asked.picture.clone() };
+    let image = Output { args, on, notation, failures: vec![], images: vec![] }.image(&asked, &picture, &found);
+    let line = || image.line(&found, found.estimate.ranking.len(), notation);
+    Ok((image.trusted, if args.json { serde_json::to_string(&image)? } else { line() }))
 }
 
 /// One of `things` per image, of which there are none, one or as many.
@@ -335,22 +468,37 @@ fn poses(flag: &str, sources: &[PoseSource], images: &[PathBuf], notation: &Nota
     each(flag, "poses", sources, images)?.into_iter().map(read).collect()
 }
 
-/// The pictures with their numbers among those that were given; and of several those in which no object is, with why.
-type Opened = (Vec<Picture>, Vec<usize>, Vec<(usize, String)>);
+/// What flags say of each picture.
+fn given(args: &Estimate, notation: &Notation) -> Result<Vec<Given>> {
+    let Estimate { images, .. } = args;
+    let rough = poses("--rough", &args.rough, images, notation)?;
+    let truths = poses("--truth", &args.truth, images, notation)?;
+    let cutouts = each("--cutout", "masks", &args.cutout, images)?;
+    let masks = each("--mask", "masks", &args.mask, images)?;
+    let boxes = each("--box", "boxes", &args.boxes, images)?;
+    let of = |i: usize| Given {
+        image: images[i].clone(),
+        instance: None,
+        cutout: cutouts[i].1.cloned(),
+        bounds: boxes[i].1.copied(),
+        mask: masks[i].1.cloned(),
+        rough: rough[i],
+        truth: truths[i],
+    };
+    Ok((0..images.len()).map(of).collect())
+}
 
-fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> Result<Opened> {
-    let truths = poses("--truth", &args.truth, &args.images, notation)?;
-    each("--cutout", "masks", &args.cutout, &args.images)?;
-    each("--mask", "masks", &args.mask, &args.images)?;
-    each("--box", "boxes", &args.boxes, &args.images)?;
-    let (mut names, mut pictures, mut numbers, mut failures) = (HashSet::new(), Vec::new(), Vec::new(), Vec::new());
-    for (number, (path, truth)) in args.images.iter().zip(truths).enumerate() {
-        warn_of_turned(path);
-        let mut picture = match opened(args, model, side, number, Known::default()) {
-            Ok(picture) => Picture { truth, ..picture },
+/// The pictures; and of several those in which no object is, with why.
+fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> Result<(Vec<Asked>, Vec<Failed>)> {
+    let looking = Looking { args, model, starts: &Starts::Neighbor4, notation };
+    let (mut names, mut asked, mut failures) = (HashSet::new(), Vec::new(), Vec::new());
+    for (number, given) in given(args, notation)?.into_iter().enumerate() {
+        warn_of_turned(&given.image);
+        let mut picture = match looking.open(&given, side, Known::default()) {
+            Ok(picture) => picture,
             // A detector may see what is not there, which says nothing of the other pictures.
             Err(error) if args.images.len() > 1 && matches!(error.downcast_ref(), Some(srn_data::Error::Empty { .. })) => {
-                failures.push((number, error.to_string()));
+                failures.push(Failed { number, image: given.image, trusted: false, failure: error.to_string() });
                 continue;
             }
             Err(error) => return Err(error),
@@ -358,27 +506,13 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
         while !names.insert(picture.name.clone()) {
             picture.name += "-again";
         }
-        pictures.push(picture);
-        numbers.push(number);
+        let source = args.poses.source(srn_instance(&given.image).as_deref())?;
+        asked.push(Asked { number, given, picture, source });
     }
     match failures.first() {
-        Some((_, failure)) if pictures.is_empty() => Err(failure.as_str().into()),
-        _ => Ok((pictures, numbers, failures)),
+        Some(Failed { failure, .. }) if asked.is_empty() => Err(failure.as_str().into()),
+        _ => Ok((asked, failures)),
     }
-}
-
-/// A picture with what is said of it; if by a box, with what is `known` of the object in it.
-fn opened(args: &Estimate, model: &Model, side: u32, number: usize, known: Known) -> Result<Picture> {
-    fn of<T>(things: &[T], number: usize) -> Option<&T> {
-        things.get(number % things.len().max(1))
-    }
-    let segmentation = of(&args.cutout, number).map(|mask| Cutout::Mask(mask));
-    let cutout = segmentation.or(of(&args.boxes, number).map(|&bounds| Cutout::Box(bounds, known)));
-    let masks = Masks { cutout, mask: of(&args.mask, number).map(PathBuf::as_path) };
-    // Of an object that the model does not know the number says nothing.
-    let any = args.unseen.then(|| model.instance_name(0));
-    let instance = any.as_deref().or(args.object.instance.as_deref());
-    Picture::open(&args.images[number], masks, model, side, instance, &args.object.camera)
 }
 
 /// What was found so far.
@@ -386,21 +520,16 @@ struct Output<'a> {
     args: &'a Estimate,
     on: On<'a>,
     notation: &'a Notation,
-    pictures: &'a [Picture],
-    /// Their numbers among those that were given.
-    numbers: &'a [usize],
-    sources: &'a [Option<Notation>],
-    /// Of pictures in which no object is.
-    failures: Vec<(usize, String)>,
+    /// Pictures in which no object is.
+    failures: Vec<Failed>,
     images: Vec<Entry>,
 }
 
 impl Output<'_> {
     /// Takes what was found of the next picture, and prints it, unless all is to be one JSON document.
-    fn add(&mut self, picture: &Picture, instance: String, found: &Found, starts: usize, bar: &ProgressBar) -> Result<()> {
-        let number = self.numbers[self.images.iter().filter(|entry| matches!(entry, Entry::Found(_))).count()];
-        bar.suspend(|| self.fail(number))?;
-        let image = self.image(number, picture, instance, found);
+    fn add(&mut self, asked: &Asked, picture: &Picture, found: &Found, starts: usize, bar: &ProgressBar) -> Result<()> {
+        bar.suspend(|| self.fail(asked.number))?;
+        let image = self.image(asked, picture, found);
         if !self.args.json {
             bar.suspend(|| print(&image.line(found, starts, self.notation)))?;
         }
@@ -410,13 +539,12 @@ impl Output<'_> {
 
     /// Tells of those pictures before this number in which no object is.
     fn fail(&mut self, before: usize) -> Result<()> {
-        let count = self.failures.iter().take_while(|(number, _)| *number < before).count();
-        for (number, failure) in self.failures.drain(..count) {
-            let image = self.args.images[number].clone();
+        let count = self.failures.iter().take_while(|failed| failed.number < before).count();
+        for failed in self.failures.drain(..count) {
             if !self.args.json {
-                print(&format!("{}  DO NOT TRUST: {failure}", image.display()))?;
+                print(&failed.line())?;
             }
-            self.images.push(Entry::Failed(Failed { image, trusted: false, failure }));
+            self.images.push(Entry::Failed(failed));
         }
         Ok(())
     }
@@ -438,7 +566,8 @@ impl Output<'_> {
         Ok(is_trusted)
     }
 
-    fn image(&self, number: usize, picture: &Picture, instance: String, found: &Found) -> ImageReport {
+    fn image(&self, Asked { given, source, .. }: &Asked, picture: &Picture, found: &Found) -> ImageReport {
+        let instance = if self.args.unseen { "unseen".into() } else { self.on.model.instance_name(picture.shot.instance) };
         let convention = self.args.poses.convention;
         let world_from_camera = convention.of_ours(found.world_from_camera);
         let [a, b, c, x, y, z] = Pose6::from_matrix(&world_from_camera).0;
@@ -457,14 +586,11 @@ impl Output<'_> {
             world_from_camera: convention.of_ours(r.pose.to_matrix()).transpose().to_cols_array_2d(),
         };
         ImageReport {
-            image: self.args.images[number].clone(),
+            image: given.image.clone(),
             instance,
             world_from_camera: world_from_camera.transpose().to_cols_array_2d(),
-            source_from_camera: self.sources[number].map(|source| source.rows(&found.world_from_camera)),
-            camera_from_object: self.sources[number]
-                .as_ref()
-                .unwrap_or(self.notation)
-                .object(&found.world_from_camera, found.confidence),
+            source_from_camera: source.map(|source| source.rows(&found.world_from_camera)),
+            camera_from_object: source.as_ref().unwrap_or(self.notation).object(&found.world_from_camera, found.confidence),
             euler_rad: [a, b, c],
             translation: [x, y, z],
             loss: found.estimate.loss,
@@ -482,6 +608,12 @@ impl Output<'_> {
             ranking: found.estimate.ranking.iter().filter(went_on).map(ranked).collect(),
             seconds: found.seconds,
         }
+    }
+}
+
+impl Failed {
+    fn line(&self) -> String {
+        format!("{}  DO NOT TRUST: {}", self.image.display(), self.failure)
     }
 }
 

@@ -1,7 +1,7 @@
 //! What `sigma-pose` reads and writes: pictures with their cameras, PNG and GIF.
 
 use std::fs::File;
-use std::io::Write;
+use std::io::{BufRead, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -203,6 +203,29 @@ pub fn warn_of_turned(picture: &Path) {
     if srn::is_turned(picture) {
         eprintln!("warning: {}: by its EXIF it is to be turned; its pixels are taken as they are stored", picture.display());
     }
+}
+
+/// Lines as they come, without blanks around them; blank ones are none.
+pub fn lines_on_stdin() -> impl Iterator<Item = Result<Vec<u8>>> {
+    let line = |line: std::io::Result<Vec<u8>>| match line {
+        Ok(line) if line.trim_ascii().is_empty() => None,
+        Ok(line) => Some(Ok(line.trim_ascii().to_vec())),
+        Err(error) => Some(Err(format!("stdin: {error}").into())),
+    };
+    std::io::stdin().lock().split(b'\n').filter_map(line)
+}
+
+/// Paths are what the system takes for one, UTF-8 or not.
+#[cfg(unix)]
+pub fn path_of(bytes: &[u8]) -> PathBuf {
+    use std::os::unix::ffi::OsStrExt;
+    std::ffi::OsStr::from_bytes(bytes).into()
+}
+
+/// Paths are what the system takes for one.
+#[cfg(not(unix))]
+pub fn path_of(bytes: &[u8]) -> PathBuf {
+    String::from_utf8_lossy(bytes).into_owned().into()
 }
 
 /// Writes an endless animation, whole or not at all; each frame with the seconds that it stays.

@@ -6,6 +6,7 @@ mod draw;
 pub mod estimate;
 pub mod evaluate;
 mod files;
+mod given;
 mod heldout;
 mod mask;
 mod notation;

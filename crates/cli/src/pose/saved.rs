@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::path::Path;
 
-use sigma_srn::photo::Shot;
 use sigma_srn::{Found, Intrinsics, Model};
 use srn_data::pixels::rgb8;
 use srn_data::srn::{self, InstanceWriter};
@@ -19,11 +18,11 @@ pub struct SavedViews {
 }
 
 impl SavedViews {
-    /// For the instances of these pictures, each in its folder in `dir`. A folder that exists is refused, or, with `force`, replaced.
-    pub fn create(dir: &Path, model: &Model, pictures: &[Picture], force: bool) -> Result<Self> {
+    /// For these instances, each in its folder in `dir`. A folder that exists is refused, or, with `force`, replaced.
+    pub fn create(dir: &Path, model: &Model, shown: impl Iterator<Item = u32>, force: bool) -> Result<Self> {
         create_dir(dir)?;
         let mut instances = BTreeMap::new();
-        for &Picture { shot: Shot { instance, .. }, .. } in pictures {
+        for instance in shown {
             if let Entry::Vacant(entry) = instances.entry(instance) {
                 entry.insert((InstanceWriter::bare(dir.join(model.instance_name(instance)), force)?, 0));
             }

@@ -1,6 +1,5 @@
 //! `sigma-pose track`: an object's pose from frame to frame.
 
-use std::io::BufRead;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -14,7 +13,9 @@ use srn_data::pixels::{ENDINGS, is_picture};
 use srn_data::target::Cutout;
 
 use super::draw;
-use super::files::{Animation, Masks, ObjectArgs, Picture, PoseSource, bounding_box, model_side, warn_of_turned};
+use super::files::{
+    Animation, Masks, ObjectArgs, Picture, PoseSource, bounding_box, lines_on_stdin, model_side, path_of, warn_of_turned,
+};
 use super::mask::MadeRight;
 use super::notation::{NotationArgs, ObjectPose};
 use super::outline;
@@ -254,32 +255,11 @@ type Frames = Box<dyn Iterator<Item = Result<PathBuf>>>;
 /// The pictures in a folder in order, those that stdin names, or the frames as they were given.
 fn frames(given: &[PathBuf]) -> Result<Frames> {
     let paths = match given {
-        [dash] if dash.as_os_str() == "-" => return Ok(Box::new(paths_on_stdin())),
+        [dash] if dash.as_os_str() == "-" => return Ok(Box::new(lines_on_stdin().map(|line| Ok(path_of(&line?))))),
         [dir] if dir.is_dir() => pictures_in(dir)?,
         _ => given.to_vec(),
     };
     Ok(Box::new(paths.into_iter().map(Ok)))
-}
-
-/// Blank lines are none. Paths are what the system takes for one, UTF-8 or not.
-fn paths_on_stdin() -> impl Iterator<Item = Result<PathBuf>> {
-    let path = |line: std::io::Result<Vec<u8>>| match line {
-        Ok(line) if line.trim_ascii().is_empty() => None,
-        Ok(line) => Some(Ok(path_of(line.trim_ascii()))),
-        Err(error) => Some(Err(format!("stdin: {error}").into())),
-    };
-    std::io::stdin().lock().split(b'\n').filter_map(path)
-}
-
-#[cfg(unix)]
-fn path_of(bytes: &[u8]) -> PathBuf {
-    use std::os::unix::ffi::OsStrExt;
-    std::ffi::OsStr::from_bytes(bytes).into()
-}
-
-#[cfg(not(unix))]
-fn path_of(bytes: &[u8]) -> PathBuf {
-    String::from_utf8_lossy(bytes).into_owned().into()
 }
 
 fn pictures_in(dir: &Path) -> Result<Vec<PathBuf>> {
