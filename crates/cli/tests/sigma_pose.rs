@@ -944,7 +944,7 @@ fn a_box_around_the_object_is_enough() {
     fail(dir, &format!("estimate table.png table.png {given} {args}"), &["table.png", "box"]);
 }
 
-/// The seat goes to the right; once something is before the whole camera, and once before the seat.
+/// The seat goes to the right; once something is before the whole camera, once before the seat, and once longer.
 #[test]
 fn a_box_in_the_first_frame_is_enough() {
     let home = TempDir::new().unwrap();
@@ -987,6 +987,22 @@ fn a_box_in_the_first_frame_is_enough() {
     assert!(doubted[4]["trusted"] == false && doubted[4]["doubt"] == "unexplained", "{}", doubted[4]);
     fail(dir, &format!("{track} --cutout masks"), &["--box", "--cutout"]);
     fail(dir, &format!("track frames --box 500,9,9,9 {args}"), &["0.png", "box 500,9,9,9"]);
+
+    // After some frames in which a hand is before all of it, it is found again where it was last seen for sure, or near that.
+    fs::create_dir(dir.join("hidden")).unwrap();
+    for k in 0..7 {
+        let path = dir.join(format!("hidden/{k}.png"));
+        on_a_table([50 + 3 * [0, 1, 1, 1, 1, 1, 2][k], 30], &path);
+        if (2..6).contains(&k) {
+            let mut picture = image::open(&path).unwrap().into_rgb8();
+            let is_hand = |x: u32, y: u32| (34 + k as u32..130).contains(&x) && y > 20;
+            picture.enumerate_pixels_mut().filter(|(x, y, _)| is_hand(*x, *y)).for_each(|(x, y, pixel)| *pixel = hand(x, y));
+            picture.save(&path).unwrap();
+        }
+    }
+    let frames = lines(&run(dir, &format!("track hidden --box {} {args}", boxes[0]), 0));
+    assert_eq!(each(&frames, "trusted"), [true, true, false, false, false, false, true].map(Some));
+    assert_eq!(frames[6]["searched"], false, "{}", frames[6]);
 }
 
 /// Pictures cut out with a rim of the table around the object, or with too little of it.

@@ -86,6 +86,17 @@ impl Tracker {
         Ok(found)
     }
 
+    /// The same from this pose, whatever the last frames led to; they still do.
+    pub fn from(
+        &self,
+        world_from_camera: DMat4,
+        frame: Query,
+        observe: impl FnMut(Progress) -> Result<(), Error>,
+    ) -> Result<Found, Error> {
+        let frame = Query { starts: vec![world_from_camera], ..self.prepared(frame)? };
+        Ok(self.near(1)?.run(&self.engine, &self.model, &[frame], observe)?.remove(0))
+    }
+
     /// Finds the pose in the last frame once more, from where it was found: cut out in a better way, say.
     pub fn again(&mut self, frame: Query, observe: impl FnMut(Progress) -> Result<(), Error>) -> Result<Option<Found>, Error> {
         let earlier = self.before.split_off(self.before.len().min(1));
@@ -125,7 +136,7 @@ impl Tracker {
             [last, ..] => iter::once(last).chain(self.expected()).collect(),
         };
         let frame = Query { starts, ..frame.clone() };
-        Ok(Some(self.near()?.run(&self.engine, &self.model, &[frame], observe)?.remove(0)))
+        Ok(Some(self.near(self.before.len())?.run(&self.engine, &self.model, &[frame], observe)?.remove(0)))
     }
 
     fn keep(&mut self, found: &Found, frame: &Query, is_searched: bool) {
@@ -142,12 +153,12 @@ impl Tracker {
         self.rim
     }
 
-    /// The next pose is near; what would have to be found from afar is searched for all around instead.
-    fn near(&self) -> Result<Search, Error> {
+    /// The next pose is near the last `known` ones; what would have to be found from afar is searched for all around instead.
+    fn near(&self, known: usize) -> Result<Search, Error> {
         let phase = |steps, stride, keep| Phase { steps, stride, keep, light: true, closer_look: false, outlines: false };
-        let phases = match (&self.before[..], self.rim) {
+        let phases = match (known, self.rim) {
             // A look says whether it stands still or goes on.
-            ([_, _, ..], _) => vec![phase(0, 4, 2), phase(3, 2, 1), phase(4, 1, 1)],
+            (2.., _) => vec![phase(0, 4, 2), phase(3, 2, 1), phase(4, 1, 1)],
             (_, Some(_)) => vec![phase(5, 2, 1), phase(3, 1, 1)],
             (_, None) => vec![phase(5, 2, 1), Phase { outlines: true, ..phase(5, 2, 1) }, phase(3, 1, 1)],
         };

@@ -20,6 +20,8 @@ pub type Observe<'a> = &'a mut dyn FnMut(Progress) -> Result<(), Error>;
 pub struct Follower {
     /// A box around the object, where it was last seen for sure.
     bounds: BoundingBox,
+    /// What it covered there, and the pose.
+    sure: Option<(FoundObject, DMat4)>,
     /// What it is expected to cover in the next frame, and a box around that.
     expected: Option<(FoundObject, BoundingBox)>,
     /// Frames in a row whose poses were not to be trusted.
@@ -43,7 +45,7 @@ pub struct Looking<'a, E> {
 impl Follower {
     /// For a first frame in which the object is in this box.
     pub fn new(bounds: BoundingBox) -> Self {
-        Follower { bounds, expected: None, doubted: 0 }
+        Follower { bounds, sure: None, expected: None, doubted: 0 }
     }
 
     /// A frame, cut out by where the object is expected in it; if nothing is there, by the box alone.
@@ -60,7 +62,15 @@ impl Follower {
         looking: &Looking<E>,
         observe: Observe,
     ) -> Result<(Shot, Tracked), E> {
-        let near = self.near(&shot, tracker, looking, observe)?;
+        let mut near = self.near(&shot, tracker, looking, observe)?;
+        // What hid it may be gone.
+        if self.doubted > 0
+            && near.as_ref().is_some_and(|(_, found)| !found.is_trusted())
+            && let Some(back) = self.back(tracker, looking, observe)?
+        {
+            tracker.restart(back.1.world_from_camera);
+            near = Some(back);
+        }
         let is_due = |found: &Found| !found.is_trusted() && self.doubted.is_multiple_of(SEARCHED);
         let around = match &near {
             Some((_, found)) if is_due(found) => (looking.open)(self.bounds, Known::default()).ok(),
@@ -86,6 +96,8 @@ impl Follower {
             // What is followed in doubt may be something else, which leads away.
             if found.is_trusted() {
                 self.bounds = bounds;
+                let there = FoundObject::of(&shot, &found.world_from_camera, looking.engine, looking.model, 1)?;
+                self.sure = Some((there, found.world_from_camera));
             }
             self.expected = Some((object, bounds));
         }
@@ -111,6 +123,19 @@ impl Follower {
             return Ok(Some((shot, found)));
         }
         Ok(Some((shot.clone(), found)))
+    }
+
+    /// From where it was last seen for sure, if it is seen for sure there.
+    fn back<E: From<Error>>(
+        &self,
+        tracker: &Tracker,
+        looking: &Looking<E>,
+        observe: Observe,
+    ) -> Result<Option<(Shot, Found)>, E> {
+        let Some((object, pose)) = &self.sure else { return Ok(None) };
+        let Ok(shot) = cut_out(self.bounds, object, looking.open) else { return Ok(None) };
+        let found = tracker.from(*pose, shot.query(vec![]), observe)?;
+        Ok(found.is_trusted().then_some((shot, found)))
     }
 
     /// From all around, of a frame that was cut out by the box alone.
