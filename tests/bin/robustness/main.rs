@@ -389,6 +389,15 @@ fn said(output: &Output) -> Box<dyn Error> {
     String::from_utf8_lossy(&output.stderr).trim().trim_start_matches("error: ").into()
 }
 
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// Of values in order.
+fn median(values: &[f64]) -> f64 {
+    0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2])
+}
+
 /// The cells of a table.
 fn line(how: How, found: &[Found]) -> String {
     let sorted = |value: fn(&Found) -> f64| {
@@ -396,8 +405,6 @@ fn line(how: How, found: &[Found]) -> String {
         values.sort_by(f64::total_cmp);
         values
     };
-    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-    let median = |values: &[f64]| 0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2]);
     let (rotation, translation) = (sorted(|f| f.rotation_deg), sorted(|f| f.translation_percent));
     let is_wrong = |f: &&Found| f.rotation_deg > 5.0;
     let trusted = || found.iter().filter(|f| f.is_trusted);

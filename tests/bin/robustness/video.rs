@@ -8,7 +8,7 @@ use rand_pcg::Pcg64Mcg;
 use serde_json::Value;
 
 use crate::photo::{Photo, SIDE};
-use crate::{MODEL, OBJECTS, OUT, Programs, Result, said};
+use crate::{MODEL, OBJECTS, OUT, Programs, Result, mean, median, said};
 
 /// Views of a spiral around each object, and which of them are frames: some ten degrees apart.
 pub const VIEWS: usize = 240;
@@ -127,8 +127,6 @@ pub fn tracked(programs: &Programs, video: &Video, effort: &str) -> Result<Strin
         values
     };
     let (rotation, translation, seconds) = (sorted(|f| f.rotation_deg), sorted(|f| f.translation_percent), sorted(|f| f.seconds));
-    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-    let median = |values: &[f64]| values[values.len() / 2];
     let is_wrong = |f: &&Frame| f.rotation_deg > 5.0;
     let trusted = || frames.iter().filter(|f| f.is_trusted);
     Ok(format!(
