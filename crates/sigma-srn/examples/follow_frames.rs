@@ -4,7 +4,8 @@
 
 use std::path::Path;
 
-use sigma_srn::{Effort, Engine, Intrinsics, Model, Options, Outline, Query, Renderer, Search, Tracked, Tracker, camera};
+use sigma_srn::photo::Shot;
+use sigma_srn::{Effort, Engine, Intrinsics, Model, Renderer, Search, Tracked, Tracker, camera};
 
 fn main() -> Result<(), sigma_srn::Error> {
     let path = std::env::args().nth(1).unwrap_or_else(|| "assets/models/compact.safetensors".into());
@@ -19,22 +20,13 @@ fn main() -> Result<(), sigma_srn::Error> {
     let mut renderer = Renderer::new(&engine, &model, 1, SIDE, SIDE)?;
 
     // For the first frame, and for those in which it was lost.
-    let search = Search::from(Options::of(Effort::Fast));
+    let search = Search::of(Effort::Fast);
     let mut tracker = Tracker::new(&engine, &model, 0, search, None)?;
     for frame in 0..20 {
         let angle = 0.1 * f64::from(frame);
         let truth = camera::look_at_origin(glam::DVec3::new(radius * angle.cos(), radius * angle.sin(), 0.4));
-        let query = Query {
-            instance: 0,
-            rgb: renderer.render(&[0], &[(truth, intrinsics)], 0)?.rgb,
-            weights: None,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            width: SIDE,
-            height: SIDE,
-            intrinsics,
-            starts: camera::around2016(radius),
-        };
+        let rgb = renderer.render(&[0], &[(truth, intrinsics)], 0)?.rgb;
+        let query = Shot::whole(rgb, intrinsics, 0, SIDE).query(camera::around2016(radius));
         let Tracked { found, is_searched } = tracker.next(query, |_| Ok(()))?;
         let (rotation, translation) = camera::pose_error(&found.world_from_camera, &truth);
         let how = if is_searched { "searched for" } else { "followed" };

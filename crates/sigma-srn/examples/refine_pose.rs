@@ -4,7 +4,8 @@
 
 use std::path::Path;
 
-use sigma_srn::{Engine, Intrinsics, Model, Outline, Query, Renderer, Search, camera};
+use sigma_srn::photo::Shot;
+use sigma_srn::{Engine, Intrinsics, Model, Renderer, Search, camera};
 
 fn main() -> Result<(), sigma_srn::Error> {
     let path = std::env::args().nth(1).unwrap_or_else(|| "assets/models/compact.safetensors".into());
@@ -18,17 +19,7 @@ fn main() -> Result<(), sigma_srn::Error> {
     let truth = camera::fixed24(model.metadata.orbit_radius.unwrap_or(1.3))[3];
     let rgb = Renderer::new(&engine, &model, 1, SIDE, SIDE)?.render(&[0], &[(truth, intrinsics)], 0)?.rgb;
 
-    let query = Query {
-        instance: 0,
-        rgb,
-        weights: None,
-        coverage: None,
-        outline: Outline::AS_GIVEN,
-        width: SIDE,
-        height: SIDE,
-        intrinsics,
-        starts: camera::neighbor4(&truth),
-    };
+    let query = Shot::whole(rgb, intrinsics, 0, SIDE).query(camera::neighbor4(&truth));
     let found = Search::default().run(&engine, &model, &[query], |progress| {
         if progress.step % 10 == 0 {
             println!("step {} of {}: {} hypotheses", progress.step, progress.steps, progress.hypotheses.len());

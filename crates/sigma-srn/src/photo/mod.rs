@@ -60,6 +60,22 @@ impl Shot {
         }
     }
 
+    /// Of what is in a box in a photograph with these intrinsics, `side` pixels square, by what is known of it; `None` where nothing in the box differs from what is around
+    /// it, or nothing is around it.
+    pub fn in_box(
+        (photo, intrinsics): (&Photo, &Intrinsics),
+        bounds: BoundingBox,
+        known: Known,
+        instance: u32,
+        side: u32,
+    ) -> Option<Self> {
+        let &Intrinsics { fx, fy, cx, cy, pixel_center } = intrinsics;
+        let mut photo = photo.clone();
+        photo.cut_out_of(bounds, known)?;
+        let square = photo.square([fx, fy, cx - pixel_center, cy - pixel_center], side as usize)?;
+        Some(Shot::of(square, instance))
+    }
+
     /// Of a picture that is such a square already, as views of data sets are.
     pub fn whole(rgb: Vec<f32>, intrinsics: Intrinsics, instance: u32, side: u32) -> Self {
         let square = ([0; 2], side as usize);
@@ -113,31 +129,24 @@ impl Shot {
 }
 
 impl Search {
-    /// The pose of the object in a box in a photograph that nobody has cut out, with the square that it was found in; by single searches, one after another ([`Boxed`]). `intrinsics` are the
-    /// photograph's, `starts` where a search for a square begins: [`Shot::around`], say. `observe` sees each of the searches.
+    /// The pose of the object in a box in a photograph, with its intrinsics, that nobody has cut out, and the square that it was found in; by single searches, one after another ([`Boxed`]).
+    /// `starts`: where a search for a square begins: [`Shot::around`], say. `observe` sees each of the searches.
     pub fn run_in_box(
         &self,
         engine: &Engine,
         model: &Model,
         instance: u32,
-        (photo, intrinsics): (&Photo, &Intrinsics),
+        photo: (&Photo, &Intrinsics),
         bounds: BoundingBox,
         starts: impl Fn(&Shot) -> Result<Vec<DMat4>, Error>,
         mut observe: impl FnMut(Progress) -> Result<(), Error>,
     ) -> Result<(Shot, Found), Error> {
         let side = model.metadata.side.unwrap_or(SIDE);
-        let &Intrinsics { fx, fy, cx, cy, pixel_center } = intrinsics;
         let open = |_, known: Known| {
-            let mut photo = photo.clone();
-            let square = photo.cut_out_of(bounds, known).and_then(|()| {
-                let intrinsics = [fx, fy, cx - pixel_center, cy - pixel_center];
-                photo.square(intrinsics, side as usize)
-            });
-            let nothing = || Error::Input {
+            Shot::in_box(photo, bounds, known, instance, side).ok_or_else(|| Error::Input {
                 input: format!("box {:?}, {:?}", bounds.corner, bounds.size),
                 what: "nothing in it differs from what is around it, or nothing is around it".into(),
-            };
-            Ok(Shot::of(square.ok_or_else(nothing)?, instance))
+            })
         };
         let (first, _) = self.tries()?;
         let single = Search { tries: vec![first.clone()], ..self.clone() };
