@@ -27,7 +27,11 @@ let stale = false;
 
 /// Of a picture with so many pixels to a row.
 const focal = (width) => width / 2 / Math.tan((Number(at("fov").value) * Math.PI) / 360);
-const plain = () => [focal(side), focal(side), side / 2, side / 2];
+/// fx, fy, cx, cy of the photograph's middle square.
+const plain = () => {
+  const pixels = photo ? (focal(photo.width) * side) / Math.min(photo.width, photo.height) : focal(side);
+  return [pixels, pixels, side / 2, side / 2];
+};
 const instance = () => at("object").selectedIndex;
 
 function say(text, kind = "") {

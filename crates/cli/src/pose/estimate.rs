@@ -266,15 +266,17 @@ type Noted = (Rc<Log>, usize);
 /// Searches for pictures as they stand, each from its own starts.
 type Pass<'a> = &'a mut dyn FnMut(&[Picture], &[Vec<DMat4>]) -> Result<Vec<Outcome<Noted>>>;
 
-impl Looking<'_> {
+impl Estimate {
     /// A picture; if it has a box, with what is `known` of the object in it.
-    fn open(&self, given: &Given, side: u32, known: Known) -> Result<Picture> {
+    fn open(&self, given: &Given, model: &Model, side: u32, known: Known) -> Result<Picture> {
         // Of an object that the model does not know the number says nothing.
-        let any = self.args.unseen.then(|| self.model.instance_name(0));
-        let instance = any.as_deref().or(self.args.object.instance.as_deref());
-        given.open(self.model, side, instance, &self.args.object.camera, known)
+        let any = self.unseen.then(|| model.instance_name(0));
+        let instance = any.as_deref().or(self.object.instance.as_deref());
+        given.open(model, side, instance, &self.object.camera, known)
     }
+}
 
+impl Looking<'_> {
     fn starts_of(&self, shot: &Shot, given: &Given) -> Result<Vec<DMat4>> {
         self.args.search.starts(self.starts, self.model, shot, given.rough.as_ref(), self.notation)
     }
@@ -286,7 +288,7 @@ impl Looking<'_> {
             let pictures: Vec<_> = asked.iter().map(|asked| asked.picture.clone()).collect();
             return pass(&pictures, &starts.collect::<Result<Vec<_>>>()?);
         }
-        let open = |i: usize, known: Known| Ok(self.open(&asked[i].given, on.side, known)?.shot);
+        let open = |i: usize, known: Known| Ok(self.args.open(&asked[i].given, on.model, on.side, known)?.shot);
         let starts = |i: usize, shot: &Shot| self.starts_of(shot, &asked[i].given);
         let boxed = Boxed { engine: on.engine, model: on.model, open: &open, starts: &starts };
         let shots = asked.iter().map(|asked| asked.picture.shot.clone()).collect();
@@ -434,7 +436,7 @@ fn of_line(args: &Estimate, model: &Model, engine: &Engine, notation: &Notation,
     let on = On { engine, model, side };
     let looking = Looking { args, model, starts: &starts(args, given.rough.is_some())?, notation };
     warn_of_turned(&given.image);
-    let picture = looking.open(&given, side, Known::default())?;
+    let picture = args.open(&given, model, side, Known::default())?;
     let source = args.poses.source(srn_instance(&given.image).as_deref())?;
     let settings = looking.settings(given.bounds.is_some())?;
     let asked = Asked { number: 0, given, picture, source };
@@ -490,11 +492,10 @@ fn given(args: &Estimate, notation: &Notation) -> Result<Vec<Given>> {
 
 /// The pictures; and of several those in which no object is, with why.
 fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> Result<(Vec<Asked>, Vec<Failed>)> {
-    let looking = Looking { args, model, starts: &Starts::Neighbor4, notation };
     let (mut names, mut asked, mut failures) = (HashSet::new(), Vec::new(), Vec::new());
     for (number, given) in given(args, notation)?.into_iter().enumerate() {
         warn_of_turned(&given.image);
-        let mut picture = match looking.open(&given, side, Known::default()) {
+        let mut picture = match args.open(&given, model, side, Known::default()) {
             Ok(picture) => picture,
             // A detector may see what is not there, which says nothing of the other pictures.
             Err(error) if args.images.len() > 1 && matches!(error.downcast_ref(), Some(srn_data::Error::Empty { .. })) => {
