@@ -5,6 +5,7 @@ use std::process::{Command, ExitStatus, Output};
 use std::time::Instant;
 
 use crate::shell::{self, root};
+use crate::web::SCENES;
 
 const MODEL: &str = "assets/models/compact.safetensors";
 const VIEWS: &str = "assets/dataset/test";
@@ -39,6 +40,14 @@ pub fn run(arguments: &[String]) -> Result<(), String> {
     let mut estimate = sigma_pose("estimate", model, "cpu");
     estimate.arg(format!("{VIEWS}/{SHOWN}.png"));
     estimate.args(["--starts", "around2016", "--truth", "auto", "--force", "--record", &format!("{OUT}/around2016")]);
+    accept(estimate.status())?;
+
+    let (object, fov, bounds) = SCENES[0];
+    println!("\nA picture that nobody has cut out, a box around the {object}, from all around:\n");
+    let mut estimate = sigma_pose("estimate", model, "cpu");
+    estimate.arg(format!("assets/scenes/{object}.png")).args(["--instance", object, "--fov", &fov.to_string()]);
+    estimate.arg(format!("--box={}", bounds.map(|pixels| pixels.to_string()).join(",")));
+    estimate.args(["--truth", &format!("assets/scenes/{object}.txt"), "--force", "--record", &format!("{OUT}/box")]);
     accept(estimate.status())?;
 
     println!("\nThe pose found for {SHARED}, refined by both executors:\n");

@@ -28,7 +28,7 @@ const SAMPLES: [&str; 9] = [
     "valve/000000",
 ];
 /// Photographs whose objects are not cut out: the object, the angle of view across in degrees, and a box around the object.
-const SCENES: [(&str, f64, [u32; 4]); 2] = [("forklift", 46.54, [35, 64, 194, 130]), ("chicken", 46.54, [75, 37, 114, 189])];
+pub const SCENES: [(&str, f64, [u32; 4]); 2] = [("forklift", 46.54, [35, 64, 194, 130]), ("chicken", 46.54, [75, 37, 114, 189])];
 const ADDRESS: &str = "127.0.0.1:8017";
 const BROWSERS: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "chrome"];
 /// A software GPU takes a minute or two.
