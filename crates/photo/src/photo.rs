@@ -58,8 +58,9 @@ impl Photo {
         [self.pixels.width, self.pixels.height]
     }
 
-    /// Leaves so much of each pixel, 0 to 1 `[height · width]`; the rest becomes white background, as what is transparent is.
+    /// Leaves so much of each pixel, 0 to 1 `[height · width]`, and nothing of those that are missing there; the rest becomes white background, as what is transparent is.
     pub fn cut_out(&mut self, object: &[f32]) {
+        let object = object.iter().chain(std::iter::repeat(&0.0));
         for ((colours, opacity), object) in self.pixels.data.chunks_exact_mut(3).zip(&mut self.opacity).zip(object) {
             colours.iter_mut().for_each(|colour| *colour = object * *colour + (1.0 - object));
             *opacity *= object;
@@ -74,8 +75,9 @@ impl Photo {
         Some(())
     }
 
-    /// How much each pixel counts, 0 to 1 `[height · width]`: what does not may be anything.
-    pub fn mask(&mut self, counts: Vec<f32>) {
+    /// How much each pixel counts, 0 to 1 `[height · width]`, those that are missing there not at all: what does not may be anything.
+    pub fn mask(&mut self, mut counts: Vec<f32>) {
+        counts.resize(self.opacity.len(), 0.0);
         self.counts = Some(counts);
     }
 
@@ -186,5 +188,13 @@ mod tests {
         cut.cut_out(&[0.2; 1200]);
         assert_eq!(cut.square([50.0, 50.0, 20.0, 15.0], 8), None);
         assert!((cut.most_shown() - 0.2).abs() < 1e-6);
+        // Of a mask that is too short the rest is none.
+        let [mut cut, mut masked] = [grey.clone(), grey];
+        cut.cut_out(&[1.0; 400]);
+        masked.mask(vec![1.0; 400]);
+        for photo in [&cut, &masked] {
+            let square = photo.square([50.0, 50.0, 20.0, 15.0], 8).unwrap();
+            assert!(square.cut && square.corner == [-4, -19] && square.extent == 48, "{square:?}");
+        }
     }
 }

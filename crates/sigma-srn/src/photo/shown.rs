@@ -20,7 +20,7 @@ impl FoundObject {
     /// By a view from `world_from_camera`, at most so many times as fine as the square.
     pub fn of(shot: &Shot, world_from_camera: &DMat4, engine: &Engine, model: &Model, finest: usize) -> Result<Self, Error> {
         let side = shot.side;
-        let times = shot.square.1.div_ceil(side as usize).clamp(1, finest) as u32;
+        let times = shot.square.1.div_ceil(side.max(1) as usize).min(finest).max(1) as u32;
         let (k, before) = (f64::from(times), 0.5 * (WIDER - 1) as f64 * f64::from(side));
         let Intrinsics { fx, fy, cx, cy, pixel_center } = shot.intrinsics;
         // Edges of pixels stay where they are, half a pixel before the centres.
