@@ -6,7 +6,8 @@
 use glam::{DMat4, DQuat};
 use serde::Serialize;
 use sigma_srn::camera::pose_error;
-use sigma_srn::{Engine, Model, Options, Outline, Phase, Query, estimate};
+use sigma_srn::photo::Shot;
+use sigma_srn::{Engine, Model, Options, Phase, Query, estimate};
 use srn_data::LoadedView;
 
 use crate::common::{Result, camera};
@@ -57,17 +58,7 @@ pub fn descend(engine: &Engine, model: &Model, views: &mut [(u32, LoadedView)], 
 /// From where it is.
 fn query(instance: u32, view: &LoadedView, side: u32) -> Query {
     let (world_from_camera, intrinsics): (DMat4, _) = camera(view);
-    Query {
-        instance,
-        rgb: view.rgb.clone(),
-        weights: None,
-        coverage: None,
-        outline: Outline::AS_GIVEN,
-        width: side,
-        height: side,
-        intrinsics,
-        starts: vec![world_from_camera],
-    }
+    Shot::whole(view.rgb.clone(), intrinsics, instance, side).query(vec![world_from_camera])
 }
 
 #[cfg(test)]
