@@ -13,6 +13,7 @@ use srn_data::camera::Axes;
 use srn_data::capture::{Bounds, Capture, Frame, FrameRecord, UpAxis};
 use srn_data::formats::{self, Format, ReadOptions, WriteOptions, Written, bop};
 use srn_data::inspect::{self, Origin};
+use srn_data::masks;
 use srn_data::srn;
 
 use crate::common::{Result, axes, named, print, refuse_existing, refuse_to_write, write_picture};
@@ -272,6 +273,71 @@ fn folder_name(name: &str) -> Result<String> {
         "" | "." | ".." => Err(format!("\"{name}\" cannot name a folder").into()),
         name if name.contains(['/', '\\']) => Err(format!("\"{name}\" cannot name a folder").into()),
         name => Ok(name.into()),
+    }
+}
+
+/// Flags of `sigma-data masks`.
+#[derive(Args, Debug)]
+pub struct Masks {
+    /// transforms.json or its folder, BOP scene, COLMAP model or its folder; an SRN instance.
+    #[arg(value_name = "SRC")]
+    path: PathBuf,
+    #[command(flatten)]
+    source: Source,
+    /// The folder of the masks, and of sheet.png, on which they can be looked at. `sigma-data import SRC --mask DIR` takes it.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Centre of the object in the source's units. Default: where the cameras look.
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, value_parser = point)]
+    centre: Option<DVec3>,
+    /// About the object's diagonal in the source's units, or more. Default: such that the cameras stand --radius diagonals away.
+    #[arg(long, value_name = "LENGTH", value_parser = above_zero)]
+    diagonal: Option<f64>,
+    /// How many of its diagonals the cameras are away from the object, on average.
+    #[arg(long, value_name = "R", default_value_t = 1.3, conflicts_with = "diagonal", value_parser = above_zero)]
+    radius: f64,
+    /// Write over masks that are there.
+    #[arg(long)]
+    force: bool,
+}
+
+impl Masks {
+    /// Runs the command.
+    pub fn run(&self) -> Result<bool> {
+        if self.source.mask.is_some() {
+            return Err("--mask: masks are what this command makes, in --out".into());
+        }
+        let (_, mut captures) = self.source.read(&self.path)?;
+        let [capture] = &mut captures[..] else {
+            let path = self.path.display();
+            return Err(
+                format!("{path}: {} objects, and masks are made for one: name its folder, or --object", captures.len()).into()
+            );
+        };
+        refuse_existing([self.out.clone()], self.force)?;
+        // What others cut out, and boxes that they know, are not asked.
+        capture.bounds = None;
+        capture.frames.iter_mut().for_each(|frame| frame.mask = None);
+        formats::refuse_sources(std::slice::from_ref(capture), std::slice::from_ref(&self.out))?;
+        let (bounds, _) = capture.find_bounds(self.centre, self.diagonal, self.radius)?;
+        let bar = progress::bar(masks::steps(capture), "steps");
+        let written = masks::write(capture, bounds, &self.out, &mut || bar.inc(1))?;
+        bar.finish_and_clear();
+        capture.skipped.iter().chain(&written.skipped).for_each(|why| eprintln!("skipped: {why}"));
+        let sheet = self.out.join("sheet.png");
+        write_picture(&sheet, &written.sheet)?;
+        let Bounds { centre: c, diagonal } = written.bounds;
+        print(&format!(
+            "{}: {} masks; centre {:.4} {:.4} {:.4}, diagonal {diagonal:.4} at most, on {}\n{}: look at it",
+            self.out.display(),
+            written.masks,
+            c.x,
+            c.y,
+            c.z,
+            written.ground,
+            sheet.display()
+        ))?;
+        Ok(true)
     }
 }
 

@@ -81,6 +81,26 @@ fn bad_calls_end_with_2_and_one_line() {
     assert_eq!(empty.status.code(), Some(2), "{}", stderr(&empty));
 }
 
+#[test]
+fn masks_are_made_of_enough_photographs_and_never_over_others() {
+    let dir = tempfile::tempdir().unwrap();
+    let (photographs, out) = (concat!(env!("CARGO_MANIFEST_DIR"), "/../data/tests/box"), dir.path().join("masks"));
+    let out_name = out.to_str().unwrap();
+    let refused = |more: &[&str]| {
+        let failed = sigma_data(&[&["masks", photographs, "--out", out_name], more].concat());
+        assert_eq!((failed.status.code(), failed.stdout.is_empty()), (Some(2), true), "{more:?}: {}", stderr(&failed));
+        stderr(&failed)
+    };
+    // There are four.
+    assert!(refused(&[]).contains("expected 6 or more of the same object, found 4"));
+    assert!(refused(&["--mask", "elsewhere"]).contains("--mask"));
+    assert!(refused(&["--diagonal", "0"]).contains("--diagonal"));
+    assert!(!out.exists());
+    fs::create_dir(&out).unwrap();
+    assert!(refused(&[]).contains("--force"));
+    assert_eq!(fs::read_dir(&out).unwrap().count(), 0);
+}
+
 /// A cache with a library in place of the fetched one: every part that the split names, as one or another flat shape.
 fn library(cache: &Path) -> Vec<Vec<String>> {
     let table = fs::read_to_string(format!("{ASSETS}/splits/parts107.tsv")).unwrap();

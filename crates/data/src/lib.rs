@@ -13,6 +13,7 @@ pub mod formats;
 pub mod gltf;
 pub mod inspect;
 pub mod ldraw;
+pub mod masks;
 pub mod mesh;
 pub mod obj;
 mod picture;

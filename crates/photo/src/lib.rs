@@ -3,9 +3,11 @@
 //!
 //! Conventions: pixel `(u, v)` is the *centre* of a pixel, row-major `v·W + u`; images are RGB in [-1, 1], their background white.
 
+mod colours;
 mod photo;
 mod pixels;
 mod segment;
+pub mod silhouettes;
 
 pub use photo::{MARGIN, Photo, Square};
 pub use pixels::Pixels;

@@ -1,10 +1,11 @@
 //! What of a picture is the object, by a box around it, as detectors give one: colours of the object and of what surrounds it, in turns with the outline that
 //! parts them best (GrabCut, Rother et al. 2004, with its cut through a graph as one through the plane: Chan, Esedoglu and Nikolova 2006).
 
-use glam::{DMat3, DVec3};
+use glam::DVec3;
 use image::imageops;
 use image::{ImageBuffer, Luma};
 
+use crate::colours::Mixture;
 use crate::pixels::Pixels;
 
 /// A rectangle in a picture, in pixels; their edges are whole numbers.
@@ -26,15 +27,12 @@ const SLACK: f64 = 0.02;
 const SLACK_OF_GUESS: f64 = 0.15;
 /// The longer side of what is looked at has at most this many cells.
 const FINEST: f64 = 256.0;
-/// Fewer cells of either side say nothing about its colours, and more than so many say nothing new.
-const FEWEST: usize = 16;
-const MOST: usize = 4096;
 /// Turns of colours and outline.
 const ROUNDS: usize = 6;
 /// What a cell's colour counts, beside a cell's length of outline.
-const COLOUR: f32 = 0.01;
+pub(crate) const COLOUR: f32 = 0.01;
 /// One cell's logarithm of odds is at most this.
-const SUREST: f64 = 20.0;
+pub(crate) const SUREST: f64 = 20.0;
 /// Logarithm of the density of any colour at all.
 const ANYTHING: f64 = -5.0;
 /// Logarithm of the odds far within, or outside of, what is guessed; and how wide the doubt about its edge is, as a share of the box's longer side.
@@ -87,7 +85,7 @@ pub(crate) fn object_in(picture: &Pixels, bounds: BoundingBox, known: Known) -> 
             break;
         }
     }
-    object.contains(&true).then(|| grid.on(picture, &object))
+    object.contains(&true).then(|| grid.on(picture.width, picture.height, &object))
 }
 
 impl BoundingBox {
@@ -98,19 +96,19 @@ impl BoundingBox {
 }
 
 /// A part of a picture in cells of equal size.
-struct Grid {
+pub(crate) struct Grid {
     /// Columns and rows.
-    size: [usize; 2],
+    pub size: [usize; 2],
     /// Edge of the first cell in the picture, and the pixels of one across and down.
     corner: [f64; 2],
     pitch: [f64; 2],
     /// Means in [-1, 1], row-major.
-    colours: Vec<DVec3>,
+    pub colours: Vec<DVec3>,
 }
 
 impl Grid {
     /// The box and its surroundings, as far as the picture goes; `None` where the box lies outside of it.
-    fn around(picture: &Pixels, bounds: BoundingBox) -> Option<Self> {
+    pub fn around(picture: &Pixels, bounds: BoundingBox) -> Option<Self> {
         let room = SURROUNDINGS * bounds.size[0].max(bounds.size[1]);
         let ends = [0, 1].map(|k| {
             let whole = [picture.width, picture.height][k] as f64;
@@ -134,8 +132,13 @@ impl Grid {
         })
     }
 
+    /// The colours of the cells that are, or are not.
+    pub fn colours_where(&self, are: &[bool], they: bool) -> Vec<DVec3> {
+        self.colours.iter().zip(are).filter(|(_, is)| **is == they).map(|(colour, _)| *colour).collect()
+    }
+
     /// Something of the middle of each cell, in pixels of the picture.
-    fn each<T>(&self, of: impl Fn([f64; 2]) -> T) -> Vec<T> {
+    pub fn each<T>(&self, of: impl Fn([f64; 2]) -> T) -> Vec<T> {
         let place = |i: usize| {
             let cell = [i % self.size[0], i / self.size[0]];
             [0, 1].map(|k| self.corner[k] + (cell[k] as f64 + 0.5) * self.pitch[k])
@@ -153,7 +156,7 @@ impl Grid {
     }
 
     /// What a length of outline costs in each cell: little where the picture has an edge.
-    fn edges(&self) -> Vec<f32> {
+    pub fn edges(&self) -> Vec<f32> {
         let width = self.size[0];
         let step = |i: usize, on: usize| self.colours.get(on).map_or(0.0, |next| next.distance_squared(self.colours[i]));
         let steps = |i: usize| if (i + 1).is_multiple_of(width) { 0.0 } else { step(i, i + 1) } + step(i, i + width);
@@ -163,9 +166,9 @@ impl Grid {
     }
 
     /// What cells say of the pixels of the picture; smooth between cells.
-    fn on(&self, picture: &Pixels, object: &[bool]) -> Vec<f32> {
+    pub fn on(&self, width: usize, height: usize, object: &[bool]) -> Vec<f32> {
         let share = |pixel: usize| {
-            let at = [pixel % picture.width, pixel / picture.width];
+            let at = [pixel % width, pixel / width];
             let [x, y] = [0, 1].map(|k| (at[k] as f64 + 0.5 - self.corner[k]) / self.pitch[k] - 0.5);
             let is_out = |at: f64, cells: usize| at <= -1.0 || at >= cells as f64;
             if is_out(x, self.size[0]) || is_out(y, self.size[1]) {
@@ -181,13 +184,20 @@ impl Grid {
             };
             near(y, self.size[1]).map(|(y, part)| part * row(y)).iter().sum::<f64>() as f32
         };
-        (0..picture.width * picture.height).map(share).collect()
+        (0..width * height).map(share).collect()
+    }
+
+    /// The cell that a place of the picture lies in.
+    pub fn cell_of(&self, at: [f64; 2]) -> Option<u32> {
+        let cell = [0, 1].map(|k| (at[k] - self.corner[k]) / self.pitch[k]);
+        let is_in = (0..2).all(|k| (0.0..self.size[k] as f64).contains(&cell[k]));
+        is_in.then(|| (cell[1] as usize * self.size[0] + cell[0] as usize) as u32)
     }
 }
 
 /// The region with the least sum of its costs and the lengths of its outline, near `start`: a program that is convex where cells may belong to it by
 /// shares, by the steps of Chambolle and Pock (2011).
-fn cut(costs: &[f32], edges: &[f32], width: usize, start: &[bool]) -> Vec<bool> {
+pub(crate) fn cut(costs: &[f32], edges: &[f32], width: usize, start: &[bool]) -> Vec<bool> {
     const STEPS: usize = 150;
     // Both steps, for differences whose norm is at most the root of eight.
     const STEP: f32 = 0.353;
@@ -221,99 +231,6 @@ fn cut(costs: &[f32], edges: &[f32], width: usize, start: &[bool]) -> Vec<bool> 
         }
     }
     share.into_iter().map(|share| share > 0.5).collect()
-}
-
-/// Colours as a sum of Gaussians.
-struct Mixture(Vec<Gaussian>);
-
-struct Gaussian {
-    /// Logarithm of what it has of all, over its width.
-    height: f64,
-    mean: DVec3,
-    precision: DMat3,
-}
-
-/// Gaussians of each side.
-const PARTS: usize = 5;
-/// Variance that every colour has, of [-1, 1]: four or five steps of 255.
-const NOISE: f64 = 1.2e-3;
-
-impl Mixture {
-    /// Of the colours of a side; `None` of too few.
-    fn of(colours: &[DVec3]) -> Option<Self> {
-        const TURNS: usize = 8;
-        if colours.len() < FEWEST {
-            return None;
-        }
-        let own: Vec<DVec3> = colours.iter().copied().step_by(colours.len().div_ceil(MOST)).collect();
-        let first = split(&own);
-        let mut mixture = Mixture::with(&own, |i, part| f64::from(u8::from(first[i] == part)));
-        for _ in 0..TURNS {
-            let parts: Vec<[f64; PARTS]> = own.iter().map(|&colour| mixture.parts(colour)).collect();
-            mixture = Mixture::with(&own, |i, part| parts[i][part]);
-        }
-        Some(mixture)
-    }
-
-    /// Of colours that belong to each part as far as it says.
-    fn with(own: &[DVec3], belongs: impl Fn(usize, usize) -> f64) -> Self {
-        let gaussian = |part: usize| {
-            let weighted = || own.iter().enumerate().map(|(i, &colour)| (colour, belongs(i, part)));
-            let weight = weighted().map(|(_, weight)| weight).sum::<f64>().max(1e-9);
-            let mean = weighted().map(|(colour, weight)| weight * colour).sum::<DVec3>() / weight;
-            let outer = |(colour, weight): (DVec3, f64)| {
-                let off = colour - mean;
-                DMat3::from_cols(off.x * off, off.y * off, off.z * off) * weight
-            };
-            let spread = weighted().map(outer).fold(DMat3::ZERO, |sum, next| sum + next);
-            let covariance = spread * weight.recip() + DMat3::from_diagonal(DVec3::splat(NOISE));
-            let height = (weight / own.len() as f64).ln() - 0.5 * covariance.determinant().ln();
-            Gaussian { height, mean, precision: covariance.inverse() }
-        };
-        Mixture((0..PARTS).map(gaussian).collect())
-    }
-
-    fn exponents(&self, colour: DVec3) -> impl Iterator<Item = f64> {
-        self.0.iter().map(move |Gaussian { height, mean, precision }| {
-            let off = colour - *mean;
-            height - 0.5 * off.dot(*precision * off)
-        })
-    }
-
-    /// How far a colour belongs to each part.
-    fn parts(&self, colour: DVec3) -> [f64; PARTS] {
-        let density = self.log_density(colour);
-        let mut parts = [0.0; PARTS];
-        parts.iter_mut().zip(self.exponents(colour)).for_each(|(part, exponent)| *part = (exponent - density).exp());
-        parts
-    }
-
-    /// But for a constant.
-    fn log_density(&self, colour: DVec3) -> f64 {
-        let most = self.exponents(colour).fold(f64::NEG_INFINITY, f64::max);
-        most + self.exponents(colour).map(|exponent| (exponent - most).exp()).sum::<f64>().ln()
-    }
-}
-
-/// To which of the [`PARTS`] each colour belongs at first: again and again the one that is most spread is cut through its mean.
-fn split(own: &[DVec3]) -> Vec<usize> {
-    let mut parts = vec![0; own.len()];
-    for new in 1..PARTS {
-        let spread = |part: usize| {
-            let in_part = || own.iter().zip(&parts).filter(move |(_, of)| **of == part).map(|(colour, _)| *colour);
-            let mean = in_part().sum::<DVec3>() / in_part().count().max(1) as f64;
-            (in_part().map(|colour| (colour - mean) * (colour - mean)).sum::<DVec3>(), mean, part)
-        };
-        let most = (0..new).map(spread).max_by(|a, b| a.0.max_element().total_cmp(&b.0.max_element()));
-        let Some((spread, mean, part)) = most else { break };
-        let channel = (0..3).max_by(|&a, &b| spread[a].total_cmp(&spread[b])).unwrap_or(0);
-        for (colour, of) in own.iter().zip(&mut parts) {
-            if *of == part && colour[channel] > mean[channel] {
-                *of = new;
-            }
-        }
-    }
-    parts
 }
 
 #[cfg(test)]

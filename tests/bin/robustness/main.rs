@@ -1,6 +1,7 @@
 //! `robustness [TABLE…] [--seed N] [--starts STARTS]`: pictures like photographs of the asset objects, spoiled in known ways, and how far off `sigma-pose` ends: tables
 //! of `docs/accuracy.md`. The pictures are left in `demo/robustness`.
 
+mod capture;
 mod photo;
 mod sides;
 mod video;
@@ -22,7 +23,7 @@ use crate::video::Video;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [others] [sides] [video] [--seed N] [--starts STARTS]";
+const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [others] [sides] [video] [captures] [--seed N] [--starts STARTS]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -183,7 +184,7 @@ fn main() -> ExitCode {
 }
 
 fn run() -> Result<()> {
-    let (mut wanted, mut has_sides, mut has_video) = (Vec::new(), false, false);
+    let (mut wanted, mut has_sides, mut has_video, mut has_captures) = (Vec::new(), false, false, false);
     let (mut seed, mut starts) = (23, "around2016".to_string());
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
@@ -192,11 +193,12 @@ fn run() -> Result<()> {
             "--starts" => starts = arguments.next().ok_or(USAGE)?,
             "sides" => has_sides = true,
             "video" => has_video = true,
+            "captures" => has_captures = true,
             name => wanted.push(TABLES.iter().find(|table| table.name == name).ok_or(USAGE)?),
         }
     }
-    if wanted.is_empty() && !has_sides && !has_video {
-        (wanted, has_sides, has_video) = (TABLES.iter().collect(), true, true);
+    if wanted.is_empty() && !has_sides && !has_video && !has_captures {
+        (wanted, has_sides, has_video, has_captures) = (TABLES.iter().collect(), true, true, true);
     }
     let programs = Programs { folder: std::env::current_exe()?.parent().ok_or("no folder")?.into(), starts };
     let mut shown = Vec::new();
@@ -239,6 +241,9 @@ fn run() -> Result<()> {
     if has_video {
         videos(&programs, seed)?;
     }
+    if has_captures {
+        captures(&programs, seed)?;
+    }
     if shown.is_empty() {
         return Ok(());
     }
@@ -278,6 +283,16 @@ fn videos(programs: &Programs, seed: u64) -> Result<()> {
     for object in 0..OBJECTS.len() {
         let video = Video::new(object, &folder, &mut random)?;
         println!("{}", video::tracked(programs, &video, "normal")?);
+    }
+    Ok(())
+}
+
+/// The table of masks that are made of photographs.
+fn captures(programs: &Programs, seed: u64) -> Result<()> {
+    println!("\ncaptures, seed {seed}, made in {OUT}\n");
+    println!("| | photographs | of both masks in both, mean / median / worst | below 0.9 | time |\n|---|---|---|---|---|");
+    for capture in capture::taken(&mut Pcg64Mcg::seed_from_u64(seed))? {
+        println!("{}", capture::masked(programs, &capture)?);
     }
     Ok(())
 }

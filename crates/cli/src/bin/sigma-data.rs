@@ -3,7 +3,7 @@
 
 use clap::{Parser, Subcommand};
 use sigma_cli::common::{finish, parse};
-use sigma_cli::data::{Export, Import, Inspect};
+use sigma_cli::data::{Export, Import, Inspect, Masks};
 use sigma_cli::render::Render;
 use sigma_cli::sets::Fetch;
 use std::process::ExitCode;
@@ -26,6 +26,8 @@ enum Command {
     Render(Render),
     /// Read photographs with known cameras (transforms.json, BOP, COLMAP) or others' SRN folders into a data set.
     Import(Import),
+    /// Find the object in photographs with known cameras that nobody has cut out, and write masks for `import --mask`.
+    Masks(Masks),
     /// Write a data set, or estimated poses, in another format, in the frame and the units that it was imported from.
     Export(Export),
     /// Count, check and draw posed pictures, or read meshes. Exit status 1 if something is wrong with them.
@@ -37,6 +39,7 @@ fn main() -> ExitCode {
         Command::Fetch(args) => args.run(),
         Command::Render(args) => args.run(),
         Command::Import(args) => args.run(),
+        Command::Masks(args) => args.run(),
         Command::Export(args) => args.run(),
         Command::Inspect(args) => args.run(),
     })
