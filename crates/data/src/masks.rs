@@ -65,7 +65,7 @@ pub fn write(capture: &Capture, bounds: Bounds, out: &Path, told: &mut dyn FnMut
         Error::field(
             &place(),
             field,
-            "an object that differs from what is around it; else say where it is",
+            "an object that differs from what is around it, where the cameras look (`sigma-data inspect`) or is said to be",
             "nothing that the photographs agree on",
         )
     };
@@ -90,7 +90,15 @@ pub fn write(capture: &Capture, bounds: Bounds, out: &Path, told: &mut dyn FnMut
     let nearer = Ball { radius: ROOM * found.ball.radius, ..found.ball };
     let (found, sights, which, mut skipped) = look(nearer, Some(found), told)?;
     let common = common_folder(frames);
-    let (mut masks, mut cells) = (0, vec![]);
+    let path_of = |frame: &Frame| {
+        let name = frame.image.strip_prefix(&common).unwrap_or(&frame.image);
+        out.join(format!("{}.png", name.display()))
+    };
+    // What an earlier call has left of photographs that get none now would be read instead.
+    for path in frames.iter().map(path_of).filter(|path| path.is_file()) {
+        std::fs::remove_file(&path).at(&path)?;
+    }
+    let mut cells = vec![];
     for (sight, frame) in sights.iter().zip(which).map(|(sight, k)| (sight, &frames[k])) {
         if !sight.is_seen() {
             skipped.push(format!("{}: nothing of the object is seen", frame.image.display()));
@@ -99,14 +107,13 @@ pub fn write(capture: &Capture, bounds: Bounds, out: &Path, told: &mut dyn FnMut
         let [width, height] = frame.camera.size.map(|size| size as u32);
         let share = sight.on(frame.camera.size[0], frame.camera.size[1]);
         let mask = GrayImage::from_fn(width, height, |x, y| Luma([(255.0 * share[(y * width + x) as usize]).round() as u8]));
-        let name = frame.image.strip_prefix(&common).unwrap_or(&frame.image);
-        let path = out.join(format!("{}.png", name.display()));
+        let path = path_of(frame);
         let folder = path.parent().unwrap_or(out);
         std::fs::create_dir_all(folder).at(folder)?;
         mask.save(&path).at(&path)?;
-        masks += 1;
         cells.push((thumbnail(frame, &mask)?, frame.name.clone()));
     }
+    let masks = cells.len();
     let cells: Vec<_> = cells.iter().map(|(picture, name)| (picture, name.as_str())).collect();
     let ground = match found.ground {
         Some(plane) => {
