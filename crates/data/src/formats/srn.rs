@@ -88,7 +88,10 @@ pub(super) fn write(capture: &Capture, dir: PathBuf, axes: Axes, options: &Write
     }
     if unmasked > 0 {
         let all = capture.frames.len();
-        written.warnings.push(format!("{}: {unmasked} of {all} pictures have no mask: their background stays", dir.display()));
+        written.warnings.push(format!(
+            "{}: {unmasked} of {all} pictures have no mask: their background stays (`sigma-data masks` makes masks)",
+            dir.display()
+        ));
     }
     let intrinsics = |camera: &Camera| {
         let [fx, fy, cx, cy] = camera.with_pixel_centre(0.0).intrinsics;
