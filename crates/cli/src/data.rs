@@ -111,6 +111,26 @@ impl Source {
     }
 }
 
+/// Flags that say where in its source the object is.
+#[derive(Args, Debug)]
+struct Place {
+    /// Centre of the object in the source's units. Default: BOP's box, or where the silhouettes' middles meet; without masks, where the cameras look.
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, value_parser = point)]
+    centre: Option<DVec3>,
+    /// Diagonal of the object's box in the source's units; an import makes it 1. Default: BOP's box, or the longest silhouette.
+    #[arg(long, value_name = "LENGTH", value_parser = above_zero)]
+    diagonal: Option<f64>,
+    /// Without --diagonal, a box and silhouettes: how many diagonals the cameras are away on average.
+    #[arg(long, value_name = "R", default_value_t = 1.3, conflicts_with = "diagonal", value_parser = above_zero)]
+    radius: f64,
+}
+
+impl Place {
+    fn bounds(&self, capture: &Capture) -> Result<(Bounds, String)> {
+        Ok(capture.find_bounds(self.centre, self.diagonal, self.radius)?)
+    }
+}
+
 /// Flags of `sigma-data import`.
 #[derive(Args, Debug)]
 pub struct Import {
@@ -131,15 +151,8 @@ pub struct Import {
     /// Room around the object in a square, on each side, as a share of its extent.
     #[arg(long, value_name = "SHARE", default_value_t = MARGIN, value_parser = share)]
     margin: f64,
-    /// Centre of the object in the source's units. Default: BOP's box, or where the silhouettes' middles meet.
-    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, value_parser = point)]
-    centre: Option<DVec3>,
-    /// Diagonal of the object's box in the source's units; becomes 1. Default: BOP's box, or the longest silhouette.
-    #[arg(long, value_name = "LENGTH", value_parser = above_zero)]
-    diagonal: Option<f64>,
-    /// Without --diagonal, a box and silhouettes: the mean distance that the cameras get.
-    #[arg(long, value_name = "R", default_value_t = 1.3, conflicts_with = "diagonal", value_parser = above_zero)]
-    radius: f64,
+    #[command(flatten)]
+    place: Place,
     /// What is up in the source: x, -x, y, -y, z, -z, or `cameras`, what is up in the pictures. Default: z; COLMAP: cameras.
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true, value_parser = up)]
     up: Option<UpAxis>,
@@ -163,7 +176,7 @@ impl Import {
             (Some(_), several) => return Err(format!("--name: {} objects cannot have one name", several.len()).into()),
             _ => {}
         }
-        let asked = self.centre.is_some() || self.diagonal.is_some() || self.up.is_some();
+        let asked = self.place.centre.is_some() || self.place.diagonal.is_some() || self.up.is_some();
         let keep = self.keep_frame || format == Format::Srn && !asked;
         let options = WriteOptions {
             axes: None,
@@ -244,7 +257,7 @@ impl Import {
     }
 
     fn place(&self, format: Format, capture: &Capture) -> Result<(DMat4, String)> {
-        let (bounds, how) = capture.find_bounds(self.centre, self.diagonal, self.radius)?;
+        let (bounds, how) = self.place.bounds(capture)?;
         let Bounds { centre: c, diagonal } = bounds;
         Ok((
             capture.placement(bounds, self.up.unwrap_or(format.up())),
@@ -287,15 +300,8 @@ pub struct Masks {
     /// The folder of the masks, and of sheet.png, on which they can be looked at. `sigma-data import SRC --mask DIR` takes it.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Centre of the object in the source's units. Default: where the cameras look.
-    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, value_parser = point)]
-    centre: Option<DVec3>,
-    /// About the object's diagonal in the source's units, or more. Default: such that the cameras stand --radius diagonals away.
-    #[arg(long, value_name = "LENGTH", value_parser = above_zero)]
-    diagonal: Option<f64>,
-    /// How many of its diagonals the cameras are away from the object, on average.
-    #[arg(long, value_name = "R", default_value_t = 1.3, conflicts_with = "diagonal", value_parser = above_zero)]
-    radius: f64,
+    #[command(flatten)]
+    place: Place,
     /// Write over masks that are there.
     #[arg(long)]
     force: bool,
@@ -315,11 +321,10 @@ impl Masks {
             );
         };
         refuse_existing([self.out.clone()], self.force)?;
-        // What others cut out, and boxes that they know, are not asked.
-        capture.bounds = None;
+        // What others cut out is not asked.
         capture.frames.iter_mut().for_each(|frame| frame.mask = None);
         formats::refuse_sources(std::slice::from_ref(capture), std::slice::from_ref(&self.out))?;
-        let (bounds, _) = capture.find_bounds(self.centre, self.diagonal, self.radius)?;
+        let (bounds, _) = self.place.bounds(capture)?;
         let bar = progress::bar(masks::steps(capture), "steps");
         let written = masks::write(capture, bounds, &self.out, &mut || bar.inc(1))?;
         bar.finish_and_clear();
