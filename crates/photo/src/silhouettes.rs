@@ -4,6 +4,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
+use self::ground::Ground;
 use crate::colours::Mixture;
 use crate::pixels::Pixels;
 use crate::segment::{BoundingBox, COLOUR, Grid, SUREST, cut};
@@ -48,11 +49,12 @@ const FIRST_ROUNDS: usize = 3;
 const ROUNDS: usize = 5;
 /// Logarithm of the density of colours, if all are alike; but for the constant of a [`Mixture`].
 const ANYTHING: f64 = 0.68;
-/// By so much less likely the object has a colour that it is not known to have, its surroundings one that they are not known to have, what stands on a known ground one of its
-/// surroundings, and any of these a colour that is one of its own in the shade.
+/// By so much less likely the object has a colour that it is not known to have, its surroundings one that they are not known to have, before a known ground one of theirs or any
+/// other, and any of these a colour that is one of its own in the shade.
 const NEW: f64 = 3.0;
 const STRANGE: f64 = 6.0;
-const ELSEWHERE: f64 = 8.0;
+const ELSEWHERE: f64 = 11.0;
+const BEFORE: f64 = 12.0;
 const SHADED: f64 = 3.0;
 /// How bright such shades are.
 const SHADES: [f64; 4] = [0.8, 0.65, 0.5, 0.4];
@@ -63,8 +65,20 @@ const UNDECIDED: f64 = 0.75;
 const DOUBT: f64 = 0.15;
 /// The object is where at least this share of photographs see it.
 const SEEN: f64 = 0.8;
-/// Colours are learnt from so many photographs.
+/// Colours are learnt from so many photographs, and where the ground is known from what so large a share of them see.
 const LEARNT_FROM: usize = 16;
+const LEARNT_WHERE: f64 = 0.5;
+/// Where the ground is known, so much more do colours count; one that is so much less likely the object's says that it is not there, others say nothing, but as if at least so many said something.
+const SURER: f64 = 4.0;
+const AGAINST: f64 = 0.5;
+const ANSWERS: f64 = 0.5;
+/// A colour so far from the ground's, in variances, is none of it.
+const UNLIKE: f64 = 12.0;
+/// Logarithm of the odds that what is out of the ball is not the object.
+const OUTSIDE: f64 = 1e9;
+
+/// Mean of the ground's colours, and their variance.
+type Shade = (DVec3, f64);
 
 /// What a photograph shows of the ball.
 pub struct Sight<'a> {
@@ -75,9 +89,13 @@ pub struct Sight<'a> {
     may_be: Vec<bool>,
     /// For each cell of space, which cell shows it.
     cells: Vec<u32>,
-    /// For each cell, the colour of the ground that is there or behind it, and its variance.
-    ground: Vec<Option<(DVec3, f64)>>,
+    /// For each cell, the colour of the ground that is there or behind it; none at all where that is not known.
+    ground: Vec<Option<Shade>>,
+    /// Colours of what is around the object.
+    others: Option<Mixture>,
     object: Vec<bool>,
+    /// Whether a cell says that it is not the object.
+    against: Vec<bool>,
 }
 
 impl<'a> Sight<'a> {
@@ -90,15 +108,17 @@ impl<'a> Sight<'a> {
         let grid = Grid::around(picture, bounds)?;
         let may_be = grid.each(|at| off(at) <= reach);
         let cells = places(ball).map(|place| project(place).and_then(|at| grid.cell_of(at)).unwrap_or(NOWHERE)).collect();
-        let (ground, object) = (vec![None; may_be.len()], vec![false; may_be.len()]);
-        Mixture::of(&grid.colours_where(&may_be, false)).map(|_| Self {
+        let (object, against) = (vec![false; may_be.len()], vec![false; may_be.len()]);
+        Mixture::of(&grid.colours_where(&may_be, false)).map(|others| Self {
             project,
             edges: grid.edges(),
             grid,
             may_be,
             cells,
-            ground,
+            ground: vec![],
+            others: Some(others),
             object,
+            against,
         })
     }
 
@@ -112,34 +132,65 @@ impl<'a> Sight<'a> {
         self.object.contains(&true)
     }
 
+    fn is_grounded(&self) -> bool {
+        !self.ground.is_empty()
+    }
+
     /// Parts it once more, by the object's own colours, if they are known, and by what all photographs think of each cell.
     fn part(&mut self, own: Option<&Mixture>, agreed: &[f64], is_first: bool) {
-        let other =
-            if is_first { self.grid.colours_where(&self.may_be, false) } else { self.grid.colours_where(&self.object, false) };
-        let Some(other) = Mixture::of(&other) else { return };
-        let of_others = |colour: DVec3, ground: &Option<(DVec3, f64)>| {
-            let shaded = SHADES.map(|shade| other.log_density((colour + 1.0) / shade - 1.0) - SHADED);
-            let around = shaded.into_iter().fold(other.log_density(colour), f64::max);
-            let known = match ground {
-                Some((mean, variance)) => {
-                    let of_ground = -0.5 * mean.distance_squared(colour) / variance - 1.5 * variance.ln();
-                    of_ground.max(around - ELSEWHERE)
-                }
-                None => around,
-            };
-            known.max(ANYTHING - STRANGE)
+        let is_other = |i: usize| {
+            let is_out = if is_first { !self.may_be[i] } else { !self.object[i] };
+            // The ground has its own colours at each place, and what photographs agree on may still be found to be the object.
+            is_out && (!self.is_grounded() || agreed[i] <= 0.0 && self.is_unlike_ground(i))
         };
-        let cost = |i: usize| {
-            if !self.may_be[i] {
-                return f32::MAX.sqrt();
-            }
-            let colour = self.grid.colours[i];
-            let mine = own.map_or(ANYTHING, |own| own.log_density(colour).max(ANYTHING - NEW));
-            let odds = (of_others(colour, &self.ground[i]) - mine).clamp(-SUREST, SUREST);
-            (COLOUR as f64 * (odds - agreed[i])) as f32
-        };
-        let costs: Vec<f32> = (0..self.object.len()).map(cost).collect();
+        let others: Vec<bool> = (0..self.object.len()).map(is_other).collect();
+        self.others = Mixture::of(&self.grid.colours_where(&others, true));
+        let weight = f64::from(COLOUR) * if self.is_grounded() { SURER } else { 1.0 };
+        let costs: Vec<f32> = self.odds(own).zip(agreed).map(|(odds, agreed)| (weight * (odds - agreed)) as f32).collect();
         self.object = cut(&costs, &self.edges, self.grid.size[0], &self.object);
+    }
+
+    /// Has cells say that they are not the object, which may have the ground's colours.
+    fn answer(&mut self, own: Option<&Mixture>) {
+        self.against = self.odds(own).map(|odds| odds > AGAINST).collect();
+    }
+
+    /// Logarithm of the odds that each cell is not the object, by its colour.
+    fn odds(&self, own: Option<&Mixture>) -> impl Iterator<Item = f64> {
+        let of_others = |i: usize| {
+            let colour = self.grid.colours[i];
+            let around = self.others.as_ref().map_or(f64::NEG_INFINITY, |others| {
+                let shaded = SHADES.map(|shade| others.log_density((colour + 1.0) / shade - 1.0) - SHADED);
+                shaded.into_iter().fold(others.log_density(colour), f64::max)
+            });
+            let of = |(mean, variance): Shade| -0.5 * mean.distance_squared(colour) / variance - 1.5 * variance.ln();
+            match self.ground_at(i).map(of).reduce(f64::max) {
+                Some(ground) => ground.max(around - ELSEWHERE).max(ANYTHING - BEFORE),
+                None => around.max(ANYTHING - STRANGE),
+            }
+        };
+        let odds = move |i: usize| {
+            let mine = own.map_or(ANYTHING, |own| own.log_density(self.grid.colours[i]).max(ANYTHING - NEW));
+            (of_others(i) - mine).clamp(-SUREST, SUREST)
+        };
+        (0..self.object.len()).map(move |i| if self.may_be[i] { odds(i) } else { OUTSIDE })
+    }
+
+    /// The ground where a cell shows it, and what between the cells to either side is most like the cell: edges of a pattern lie somewhere in their cells.
+    fn ground_at(&self, i: usize) -> impl Iterator<Item = Shade> {
+        let known = |at: usize| self.ground.get(at).copied().flatten();
+        let between = move |step: usize| {
+            let ((one, its), (other, others)) = (known(i.wrapping_sub(step))?, known(i + step)?);
+            let way = other - one;
+            let share = ((self.grid.colours[i] - one).dot(way) / (way.length_squared() + 1e-12)).clamp(0.0, 1.0);
+            Some((one + share * way, its + share * (others - its)))
+        };
+        known(i).into_iter().flat_map(move |own| [Some(own), between(1), between(self.grid.size[0])]).flatten()
+    }
+
+    /// Whether a cell is not the ground, by its colour.
+    fn is_unlike_ground(&self, i: usize) -> bool {
+        self.ground_at(i).all(|(mean, variance)| mean.distance_squared(self.grid.colours[i]) > UNLIKE * variance)
     }
 
     /// In which share of the photographs at most some place that each cell shows is the object.
@@ -172,9 +223,9 @@ pub fn find(sights: &mut [Sight], ball: Ball, ups: &[DVec3], before: Option<Foun
         Some(Found { ground: None, .. }) => None,
         None => rounds(sights, FIRST_ROUNDS, None, None, told).map(|_| ground::under(sights, ball, ups))?,
     };
-    let ground = plane.map(|plane| ground::Ground::new(plane, sights, ball));
-    let own = rounds(sights, ROUNDS, None, ground.as_ref(), told)?;
-    let shares = shares(sights);
+    let mut ground = plane.map(|plane| Ground::new(plane, sights, ball));
+    let own = rounds(sights, ROUNDS, None, ground.as_mut(), told)?;
+    let shares = shares(sights, ground.as_ref());
     let inside: Vec<DVec3> = places(ball).zip(&shares).filter(|(_, share)| **share > SEEN).map(|(place, _)| place).collect();
     let [low, high] = [DVec3::min, DVec3::max].map(|of: fn(DVec3, DVec3) -> DVec3| inside.iter().copied().reduce(of));
     let centre = 0.5 * (low? + high?);
@@ -187,12 +238,13 @@ fn rounds(
     sights: &mut [Sight],
     rounds: usize,
     mut own: Option<Mixture>,
-    ground: Option<&ground::Ground>,
+    mut ground: Option<&mut Ground>,
     told: &mut dyn FnMut(),
 ) -> Option<Mixture> {
-    let mut shares = Vec::new();
+    let learnt_where = if ground.is_some() { LEARNT_WHERE } else { UNDECIDED };
+    let mut agreed_on = Vec::new();
     for round in 0..rounds {
-        if let Some(ground) = ground {
+        if let Some(ground) = &mut ground {
             ground.show(sights);
         }
         if round == 0 {
@@ -205,29 +257,46 @@ fn rounds(
             };
             let agreed = match round {
                 0 => vec![0.0; sight.object.len()],
-                _ => sight.most(&shares).into_iter().map(sure).collect(),
+                _ => sight.most(&agreed_on).into_iter().map(sure).collect(),
             };
             sight.part(own.as_ref(), &agreed, round == 0);
         });
-        shares = self::shares(sights);
+        agreed_on = asked(sights, own.as_ref(), ground.as_deref());
         let few = sights.iter().step_by(sights.len().div_ceil(LEARNT_FROM).max(1));
         let colours = few.flat_map(|sight| {
-            let is_own =
-                sight.most(&shares).into_iter().zip(&sight.object).map(|(share, &is_object)| is_object && share > UNDECIDED);
-            sight.grid.colours_where(&is_own.collect::<Vec<_>>(), true)
+            let is_own = |(i, share): (usize, f64)| sight.object[i] && share > learnt_where && sight.is_unlike_ground(i);
+            sight.grid.colours_where(&sight.most(&agreed_on).into_iter().enumerate().map(is_own).collect::<Vec<_>>(), true)
         });
         own = Some(Mixture::of(&colours.collect::<Vec<_>>())?);
+        if ground.is_some() {
+            agreed_on = asked(sights, own.as_ref(), ground.as_deref());
+        }
         told();
     }
     own
 }
 
-/// For each cell of space, in which share of the photographs that show it the object is seen there; beside the largest share of all, for something may be before it in some.
-fn shares(sights: &[Sight]) -> Vec<f64> {
+/// What photographs say of the cells of space, if the object has these colours.
+fn asked(sights: &mut [Sight], own: Option<&Mixture>, ground: Option<&Ground>) -> Vec<f64> {
+    if ground.is_some() {
+        sights.par_iter_mut().for_each(|sight| sight.answer(own));
+    }
+    shares(sights, ground)
+}
+
+/// For each cell of space, in which share of the photographs that show it the object is seen there; beside the largest share of all, for something may be before it in some. On a
+/// known ground those do not count that say nothing, and nothing is below it.
+fn shares(sights: &[Sight], ground: Option<&Ground>) -> Vec<f64> {
+    let answers = if ground.is_some() { ANSWERS } else { 1.0 };
     let share = |i: usize| {
+        if ground.is_some_and(|ground| ground.is_below[i]) {
+            return 0.0;
+        }
         let seen = || sights.iter().filter(|sight| sight.cells[i] != NOWHERE);
-        let object = seen().filter(|sight| sight.object[sight.cells[i] as usize]).count();
-        object as f64 / seen().count().max(1) as f64
+        let count = |is: fn(&Sight, usize) -> bool| seen().filter(|sight| is(sight, sight.cells[i] as usize)).count() as f64;
+        let object = count(|sight, cell| sight.object[cell]);
+        let against = count(|sight, cell| sight.against[cell] && !sight.object[cell]);
+        object / (object + against).max(answers * seen().count() as f64).max(1.0)
     };
     let shares: Vec<f64> = (0..sights.first().map_or(0, |sight| sight.cells.len())).into_par_iter().map(share).collect();
     let most = shares.iter().copied().fold(0.5, f64::max);
@@ -252,7 +321,7 @@ mod ground {
     use glam::DVec3;
     use rayon::prelude::*;
 
-    use super::{Ball, NOWHERE, Plane, Sight};
+    use super::{Ball, NOWHERE, Plane, Shade, Sight, places};
 
     /// What is looked at, in radii around the foot of the ball's centre: not what is under the object, or near it.
     const NEAREST: f64 = 0.6;
@@ -277,6 +346,10 @@ mod ground {
     /// Places of the ground across, and how far they reach.
     const ACROSS: usize = 256;
     const REACH: f64 = 2.0;
+    /// Cells so far from such places are filled.
+    const FILLED: usize = 4;
+    /// What is hidden now has the colours of before, if their variance was less.
+    const CERTAIN: f64 = 0.02;
     /// Variance that its colours have beside what is seen.
     const NOISE: f64 = 4e-3;
 
@@ -365,8 +438,15 @@ mod ground {
         (median, squares[..most].iter().sum::<f64>() / (3 * most) as f64)
     }
 
-    /// A plane, and which cells of each sight show its places.
-    pub struct Ground(Vec<Vec<u32>>);
+    /// A plane with its pattern.
+    pub struct Ground {
+        /// Which cells of each sight show its places.
+        shown: Vec<Vec<u32>>,
+        /// Their colours.
+        colours: Vec<Option<Shade>>,
+        /// Whether cells of space lie below it, or on it.
+        pub is_below: Vec<bool>,
+    }
 
     impl Ground {
         /// Of these sights.
@@ -375,21 +455,27 @@ mod ground {
                 let cell = |at| (sight.project)(place(plane, ball, at)).and_then(|at| sight.grid.cell_of(at)).unwrap_or(NOWHERE);
                 square(ACROSS, REACH).map(cell).collect()
             };
-            Ground(sights.iter().map(cells).collect())
+            let lowest = plane.offset + 2.0 * ball.radius / super::ACROSS as f64;
+            Ground {
+                shown: sights.iter().map(cells).collect(),
+                colours: vec![None; ACROSS * ACROSS],
+                is_below: places(ball).map(|place| plane.normal.dot(place) < lowest).collect(),
+            }
         }
 
         /// Tells every sight the colours of the ground, as those show it that have nothing before it.
-        pub fn show(&self, sights: &mut [Sight]) {
+        pub fn show(&mut self, sights: &mut [Sight]) {
             let colour = |i: usize| {
-                let seen = sights.iter().zip(&self.0).filter(|(_, shown)| shown[i] != NOWHERE);
+                let seen = sights.iter().zip(&self.shown).filter(|(_, shown)| shown[i] != NOWHERE);
                 let bare = seen.filter(|(sight, shown)| !sight.object[shown[i] as usize]);
                 let mut colours: Vec<DVec3> = bare.map(|(sight, shown)| sight.grid.colours[shown[i] as usize]).collect();
-                (colours.len() >= FEWEST).then(|| typical(&mut colours))
+                let before = self.colours[i].filter(|(_, variance)| *variance < CERTAIN);
+                if colours.len() >= FEWEST { Some(typical(&mut colours)) } else { before }
             };
-            let ground: Vec<_> = (0..ACROSS * ACROSS).into_par_iter().map(colour).collect();
-            sights.par_iter_mut().zip(&self.0).for_each(|(sight, shown)| {
+            self.colours = (0..ACROSS * ACROSS).into_par_iter().map(colour).collect();
+            sights.par_iter_mut().zip(&self.shown).for_each(|(sight, shown)| {
                 let mut sums = vec![(0.0, DVec3::ZERO, 0.0); sight.object.len()];
-                for (&cell, ground) in shown.iter().zip(&ground).filter(|(cell, _)| **cell != NOWHERE) {
+                for (&cell, ground) in shown.iter().zip(&self.colours).filter(|(cell, _)| **cell != NOWHERE) {
                     if let Some((mean, variance)) = ground {
                         let (count, sum, squares) = &mut sums[cell as usize];
                         *count += 1.0;
@@ -402,8 +488,23 @@ mod ground {
                     (count > 0.0).then(|| (mean, NOISE + (squares / count - mean.length_squared() / 3.0).max(0.0)))
                 };
                 sight.ground = sums.into_iter().map(of_cell).collect();
+                for _ in 0..FILLED {
+                    sight.ground = filled(&sight.ground, sight.grid.size[0]);
+                }
             });
         }
+    }
+
+    /// With the mean of those beside them for cells between places: near ones are smaller.
+    fn filled(ground: &[Option<Shade>], width: usize) -> Vec<Option<Shade>> {
+        let near = |i: usize| {
+            let beside = [i.wrapping_sub(1), i + 1, i.wrapping_sub(width), i + width];
+            let known = || beside.into_iter().filter_map(|at| ground.get(at).copied().flatten());
+            let count = known().count() as f64;
+            let mean = known().map(|(mean, _)| mean).sum::<DVec3>() / count;
+            (count > 1.0).then(|| (mean, known().map(|(_, variance)| variance).sum::<f64>() / count))
+        };
+        ground.iter().enumerate().map(|(i, own)| own.or_else(|| near(i))).collect()
     }
 }
 
@@ -478,16 +579,29 @@ mod tests {
         assert!(found.ball.centre.length() < 0.06 && (found.ball.radius / RADIUS - 1.0).abs() < 0.25, "{:?}", found.ball);
         let ground = found.ground.unwrap();
         assert!(ground.normal.distance(DVec3::Z) < 0.02 && (ground.offset + RADIUS).abs() < 0.02, "{ground:?}");
-        for (sight, (_, truth)) in sights.iter().zip(&photographs) {
-            let mask = sight.on(SIDE, SIDE);
-            let of = |both: fn(bool, bool) -> bool| {
-                mask.iter().zip(truth).filter(|(share, truth)| both(**share > 0.5, **truth)).count()
-            };
-            let (inside, all) = (of(|a, b| a && b), of(|a, b| a || b));
-            assert!(sight.is_seen() && 20 * inside > 17 * all, "{inside} of {all}");
-        }
+        let least = sights.iter().zip(&photographs).map(|(sight, (_, truth))| in_both(sight, truth)).reduce(f64::min).unwrap();
+        assert!(least > 0.85, "{least}");
         let again = find(&mut sights, BALL, &[], Some(found), &mut || steps += 1).unwrap();
         assert_eq!((again.ground, steps), (Some(ground), STEPS[0] + STEPS[1]));
+    }
+
+    /// What of the mask or the truth is both.
+    fn in_both(sight: &Sight, truth: &[bool]) -> f64 {
+        let mask = sight.on(SIDE, SIDE);
+        let count =
+            |is: fn(bool, bool) -> bool| mask.iter().zip(truth).filter(|(share, truth)| is(**share > 0.5, **truth)).count();
+        count(|a, b| a && b) as f64 / count(|a, b| a || b) as f64
+    }
+
+    #[test]
+    fn small_squares_of_the_ground_are_not_taken_for_the_object() {
+        let photographs: Vec<_> = (0..13).map(|view| photograph(view, [0.8, -0.5, -0.5], 0.2)).collect();
+        let projections: Vec<_> = (0..13).map(|view| move |place: DVec3| project(view, place)).collect();
+        let both = photographs.iter().zip(&projections);
+        let mut sights: Vec<_> = both.map(|((picture, _), by)| Sight::of(picture, by, BALL).unwrap()).collect();
+        find(&mut sights, BALL, &[DVec3::Z], None, &mut || ()).unwrap();
+        let least = sights.iter().zip(&photographs).map(|(sight, (_, truth))| in_both(sight, truth)).reduce(f64::min).unwrap();
+        assert!(least > 0.75, "{least}");
     }
 
     #[test]
