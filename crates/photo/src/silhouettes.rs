@@ -146,11 +146,13 @@ impl<'a> Sight<'a> {
         let others: Vec<bool> = (0..self.object.len()).map(is_other).collect();
         self.others = Mixture::of(&self.grid.colours_where(&others, true));
         let weight = f64::from(COLOUR) * if self.is_grounded() { SURER } else { 1.0 };
-        let costs: Vec<f32> = self.odds(own).zip(agreed).map(|(odds, agreed)| (weight * (odds - agreed)) as f32).collect();
+        let odds: Vec<f64> = self.odds(own).collect();
+        self.against = odds.iter().map(|odds| *odds > AGAINST).collect();
+        let costs: Vec<f32> = odds.iter().zip(agreed).map(|(odds, agreed)| (weight * (odds - agreed)) as f32).collect();
         self.object = cut(&costs, &self.edges, self.grid.size[0], &self.object);
     }
 
-    /// Has cells say that they are not the object, which may have the ground's colours.
+    /// Has cells say whether they are not the object, if it has these colours.
     fn answer(&mut self, own: Option<&Mixture>) {
         self.against = self.odds(own).map(|odds| odds > AGAINST).collect();
     }
@@ -244,8 +246,9 @@ fn rounds(
     let learnt_where = if ground.is_some() { LEARNT_WHERE } else { UNDECIDED };
     let mut agreed_on = Vec::new();
     for round in 0..rounds {
-        if let Some(ground) = &mut ground {
-            ground.show(sights);
+        match &mut ground {
+            Some(ground) => ground.show(sights),
+            None => sights.iter_mut().for_each(|sight| sight.ground.clear()),
         }
         if round == 0 {
             sights.iter_mut().for_each(|sight| sight.object.fill(false));
@@ -261,7 +264,7 @@ fn rounds(
             };
             sight.part(own.as_ref(), &agreed, round == 0);
         });
-        agreed_on = asked(sights, own.as_ref(), ground.as_deref());
+        agreed_on = shares(sights, ground.as_deref());
         let few = sights.iter().step_by(sights.len().div_ceil(LEARNT_FROM).max(1));
         let colours = few.flat_map(|sight| {
             let is_own = |(i, share): (usize, f64)| sight.object[i] && share > learnt_where && sight.is_unlike_ground(i);
@@ -269,19 +272,12 @@ fn rounds(
         });
         own = Some(Mixture::of(&colours.collect::<Vec<_>>())?);
         if ground.is_some() {
-            agreed_on = asked(sights, own.as_ref(), ground.as_deref());
+            sights.par_iter_mut().for_each(|sight| sight.answer(own.as_ref()));
+            agreed_on = shares(sights, ground.as_deref());
         }
         told();
     }
     own
-}
-
-/// What photographs say of the cells of space, if the object has these colours.
-fn asked(sights: &mut [Sight], own: Option<&Mixture>, ground: Option<&Ground>) -> Vec<f64> {
-    if ground.is_some() {
-        sights.par_iter_mut().for_each(|sight| sight.answer(own));
-    }
-    shares(sights, ground)
 }
 
 /// For each cell of space, in which share of the photographs that show it the object is seen there; beside the largest share of all, for something may be before it in some. On a
