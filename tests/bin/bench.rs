@@ -68,9 +68,10 @@ struct PeerRow {
     device: &'static str,
 }
 
-/// One line of the table of costs against work: a pose step of Adam at width 64.
+/// One line of the table of costs against work: a pose step of Adam.
 #[derive(serde::Serialize)]
 struct Scaling {
+    width: u32,
     executor: &'static str,
     hypotheses: u32,
     side: u32,
@@ -189,12 +190,13 @@ fn run() -> Result<()> {
         drop(peers);
 
         for bench in &benches {
-            if width == 64 && !quick {
+            if !quick {
                 let works = SCALING.map(|(hypotheses, side)| bench.pose_step(ADAM, hypotheses, side));
                 let works = works.into_iter().collect::<Result<_>>()?;
-                let rows = report.take_turns(if bench.is_gpu() { turns } else { many_turns }, works, "cost against work", &[])?;
+                let turns = if width == 64 && !bench.is_gpu() { many_turns } else { turns };
+                let rows = report.take_turns(turns, works, "cost against work", &[])?;
                 for ((hypotheses, side), Row { executor, seconds, .. }) in SCALING.into_iter().zip(rows) {
-                    report.scaling.push(Scaling { executor, hypotheses, side, rays: hypotheses * side * side, seconds });
+                    report.scaling.push(Scaling { width, executor, hypotheses, side, rays: hypotheses * side * side, seconds });
                 }
             }
             report.kernels.extend(bench.profile(bench.name())?);
@@ -292,12 +294,12 @@ impl Report {
         text += "|---|---|---|---|---|---|---|---|\n";
         self.rows.iter().for_each(|row| text += &format!("{}\n", line(row)));
         if !self.scaling.is_empty() {
-            text += "\nCost against work, a pose step of Adam at width 64:\n\n";
-            text += "| executor | hypotheses | side | rays | median time | µs a ray |\n|---|---|---|---|---|---|\n";
+            text += "\nCost against work, a pose step of Adam:\n\n";
+            text += "| width | executor | hypotheses | side | rays | median time | µs a ray |\n|---|---|---|---|---|---|---|\n";
         }
-        for Scaling { executor, hypotheses, side, rays, seconds } in &self.scaling {
+        for Scaling { width, executor, hypotheses, side, rays, seconds } in &self.scaling {
             let each = 1e6 * seconds / f64::from(*rays);
-            text += &format!("| {executor} | {hypotheses} | {side} | {rays} | {:.1} ms | {each:.2} |\n", 1e3 * seconds);
+            text += &format!("| {width} | {executor} | {hypotheses} | {side} | {rays} | {:.1} ms | {each:.2} |\n", 1e3 * seconds);
         }
         text += "\nKernels of a pose step of Adam, and on a GPU of a training step, each timed alone:\n\n";
         text += "| work | width | executor | kernel | steps | ms | GFLOP/s |\n|---|---|---|---|---|---|---|\n";
