@@ -27,8 +27,15 @@ fn found(engine: &Engine) -> (f64, f64) {
         starts,
     };
     let phases = vec![Phase { steps: 30, stride: 1, keep: usize::MAX, light: false, closer_look: false, outlines: false }];
-    let options =
-        Options { method: Method::Bfgs { soft: 1.0, grain: 0.0 }, min_starts: 0, align: false, phases, anew: 0, seed: 0 };
+    let options = Options {
+        method: Method::Bfgs { soft: 1.0, grain: 0.0 },
+        min_starts: 0,
+        align: false,
+        phases,
+        anew: 0,
+        settle: 0,
+        seed: 0,
+    };
     let estimate = estimate(engine, model, &[query], &options, |_| Ok(())).unwrap().remove(0);
     (camera::pose_error(&estimate.pose.to_matrix(), &truth).0, estimate.loss)
 }

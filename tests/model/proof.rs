@@ -36,8 +36,15 @@ fn found(engine: &Engine) -> Result<[f64; 6], Error> {
     let query =
         Query { instance: 1, intrinsics, width, height, rgb, weights: None, coverage: None, outline: Outline::AS_GIVEN, starts };
     let phases = vec![Phase { steps: 4, stride: 1, keep: usize::MAX, light: false, closer_look: false, outlines: false }];
-    let options =
-        Options { method: Method::Bfgs { soft: 1.0, grain: 0.0 }, min_starts: 0, align: false, phases, anew: 0, seed: 0 };
+    let options = Options {
+        method: Method::Bfgs { soft: 1.0, grain: 0.0 },
+        min_starts: 0,
+        align: false,
+        phases,
+        anew: 0,
+        settle: 0,
+        seed: 0,
+    };
     Ok(estimate(engine, model, &[query], &options, |_| Ok(()))?.remove(0).pose.0)
 }
 

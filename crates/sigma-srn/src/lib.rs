@@ -7,6 +7,7 @@
 //! (the object's bounding-box diagonal is 1), colours in [-1, 1].
 
 pub mod camera;
+mod cholesky;
 pub mod confidence;
 mod descent;
 mod engine;

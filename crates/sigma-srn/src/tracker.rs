@@ -165,7 +165,7 @@ impl Tracker {
         let (first, _) = self.search.tries()?;
         // Steps so few are those of BFGS, also after a first search the paper's way.
         let Options { method, .. } = Options::default();
-        let options = Options { method, phases, min_starts: 0, align: false, ..first.clone() };
+        let options = Options { method, phases, min_starts: 0, align: false, settle: 0, ..first.clone() };
         Ok(Search { tries: vec![options], accept: self.search.accept })
     }
 }

@@ -43,7 +43,7 @@ pub fn estimate_unseen(
     let phase = |steps, stride, keep| Phase { steps, stride, keep, light: false, closer_look: false, outlines: false };
     // The coarsest look that still sees something of the image.
     let coarse = (query.width.min(query.height) / 8).max(1);
-    let options = |phases| Options { phases, anew: 0, min_starts: 0, align: false, seed, ..Options::default() };
+    let options = |phases| Options { phases, anew: 0, settle: 0, min_starts: 0, align: false, seed, ..Options::default() };
     let looks = estimate(engine, model, &known, &options(vec![phase(0, coarse, usize::MAX), phase(8, 4, 1)]), |_| Ok(()))?;
     let mut order: Vec<usize> = (0..looks.len()).collect();
     order.sort_by(|&a, &b| looks[a].loss.total_cmp(&looks[b].loss));

@@ -45,7 +45,7 @@ pub fn descend(engine: &Engine, model: &Model, views: &mut [(u32, LoadedView)], 
     }
     let queries: Vec<Query> = views.iter().map(|(instance, view)| query(*instance, view, side)).collect();
     let phase = Phase { steps: STEPS, stride: 1, keep: 1, light: false, closer_look: false, outlines: false };
-    let options = Options { phases: vec![phase], min_starts: 0, align: false, anew: 0, ..Options::default() };
+    let options = Options { phases: vec![phase], min_starts: 0, align: false, anew: 0, settle: 0, ..Options::default() };
     for ((_, view), estimate) in views.iter_mut().zip(estimate(engine, model, &queries, &options, |_| Ok(()))?) {
         let (from, to) = (camera(view).0, estimate.pose.to_matrix());
         let rotation = DQuat::from_mat4(&from).slerp(DQuat::from_mat4(&to), SHARE);

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::Serialize;
 
+use crate::cholesky::{cholesky, forward};
 use crate::confidence::Calibration;
 use crate::estimator::Estimate;
 use crate::model::Model;
@@ -63,6 +64,14 @@ pub fn motion(from: &DMat4, to: &DMat4) -> [f64; 6] {
     let shift = camera_from_world * to.w_axis.truncate() - turn * (camera_from_world * from.w_axis.truncate());
     let [a, b, c] = DQuat::from_mat3(&turn).normalize().to_scaled_axis().to_array();
     [a, b, c, shift.x, shift.y, shift.z]
+}
+
+/// The pose that a [`motion`] takes this one to.
+pub(crate) fn moved(from: &DMat4, motion: &[f64; 6]) -> DMat4 {
+    let [a, b, c, x, y, z] = *motion;
+    let (axes, turn) = (DMat3::from_mat4(*from), DMat3::from_quat(DQuat::from_scaled_axis(DVec3::new(a, b, c))));
+    let place = axes * (turn * (axes.transpose() * from.w_axis.truncate()) + DVec3::new(x, y, z));
+    DMat4::from_mat3_translation(axes * turn, place)
 }
 
 impl Calibration {
@@ -213,35 +222,10 @@ fn distance(covariance: &Matrix6, motion: &[f64; 6]) -> Option<(f64, f64)> {
     Some((log_determinant, forward(&lower, *motion).iter().map(|x| x * x).sum()))
 }
 
-/// `L` of `L Lᵀ = m`; `None` if `m` is not positive.
-fn cholesky(m: &Matrix6) -> Option<Matrix6> {
-    let mut lower = [[0.0; 6]; 6];
-    for i in 0..6 {
-        for j in 0..=i {
-            let sum = m[i][j] - (0..j).map(|k| lower[i][k] * lower[j][k]).sum::<f64>();
-            // Also where it is no number.
-            if i == j && !(sum > 0.0 && sum.is_finite()) {
-                return None;
-            }
-            lower[i][j] = if i == j { sum.sqrt() } else { sum / lower[j][j] };
-        }
-    }
-    Some(lower)
-}
-
 /// By how much second derivatives and a gradient promise a lower loss, `½ gᵀ B⁻¹ g`: nothing where they are not those near a minimum.
 pub(crate) fn promise(curvature: &Matrix6, gradient: &[f64; 6]) -> f64 {
     let squares = |lower: Matrix6| forward(&lower, *gradient).iter().map(|x| x * x).sum::<f64>();
     cholesky(curvature).map_or(0.0, |lower| 0.5 * squares(lower))
-}
-
-/// `L⁻¹ x`.
-fn forward(lower: &Matrix6, mut x: [f64; 6]) -> [f64; 6] {
-    for i in 0..6 {
-        let known: f64 = (0..i).map(|k| lower[i][k] * x[k]).sum();
-        x[i] = (x[i] - known) / lower[i][i];
-    }
-    x
 }
 
 #[cfg(test)]
@@ -324,13 +308,13 @@ mod tests {
     #[test]
     fn a_motion_does_what_it_says() {
         let from = look_at_origin(DVec3::new(1.0, -0.6, 0.5));
-        let (omega, upsilon) = (DVec3::new(0.1, -0.2, 0.3), DVec3::new(0.02, 0.03, -0.05));
-        let rotation = DMat3::from_mat4(from);
-        let turn = DMat3::from_quat(DQuat::from_scaled_axis(omega));
-        let place = rotation * (turn * (rotation.transpose() * from.w_axis.truncate()) + upsilon);
-        let to = DMat4::from_mat3_translation(rotation * turn, place);
-        let expected = [0.1, -0.2, 0.3, 0.02, 0.03, -0.05];
-        assert!(motion(&from, &to).iter().zip(expected).all(|(x, y)| (x - y).abs() < 1e-12), "{:?}", motion(&from, &to));
+        let by = [0.1, -0.2, 0.3, 0.02, 0.03, -0.05];
+        let to = moved(&from, &by);
+        assert!(motion(&from, &to).iter().zip(by).all(|(x, y)| (x - y).abs() < 1e-12), "{:?}", motion(&from, &to));
+        // The object's centre as either camera sees it: a turn leaves it in place, a shift of the camera moves it the other way.
+        let [before, turned, shifted] = [[0.0; 6], [0.1, -0.2, 0.3, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.02, 0.03, -0.05]]
+            .map(|by| moved(&from, &by).inverse().w_axis.truncate());
+        assert!((turned - before).length() < 1e-12 && (shifted - before + DVec3::new(0.02, 0.03, -0.05)).length() < 1e-12);
     }
 
     #[test]

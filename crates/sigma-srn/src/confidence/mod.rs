@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-pub(crate) use self::deviation::promise;
 pub use self::deviation::{Confidence, Known, Matrix6, WITHIN_95, fit, motion};
+pub(crate) use self::deviation::{moved, promise};
 pub use self::doubt::{Doubt, LEAST_UNEXPLAINED, UNEXPLAINED, unexplained, unexplained_doubt};
 pub(crate) use self::doubt::{explains_colours, hidden_doubt};
 

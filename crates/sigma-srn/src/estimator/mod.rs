@@ -5,9 +5,11 @@ mod look;
 mod options;
 mod place;
 mod query;
+mod settle;
 mod targets;
 
 use std::borrow::Cow;
+use std::cmp::Ordering;
 use std::iter::{self, zip};
 
 use glam::DMat4;
@@ -86,7 +88,8 @@ pub struct Estimate {
     pub width: u32,
     /// How long the object's diagonal is in the picture, as a part of the picture's width.
     pub extent: f64,
-    /// All starts, the winner first: more phases before fewer, then by loss.
+    /// All starts, the winner first, then more phases before fewer, then by loss. What lies beside the winner may have a loss a little lower where that has settled, see
+    /// [`Options::settle`].
     pub ranking: Vec<Ranked>,
 }
 
@@ -117,12 +120,39 @@ struct Hypothesis {
     phases: usize,
     /// How the outline of the image's mask is moved, in the running phase.
     outline: Outline,
+    /// Whether it is the best of its image, taken to where the loss around it is least.
+    is_settled: bool,
 }
 
 impl Hypothesis {
     /// Of a start, which has been in no phase yet.
     fn new(query: usize, start: usize, pose: Pose6, outline: Outline) -> Self {
-        Hypothesis { query, start, pose, loss: f64::INFINITY, curvature: None, promise: 0.0, phases: 0, outline }
+        Hypothesis {
+            query,
+            start,
+            pose,
+            loss: f64::INFINITY,
+            curvature: None,
+            promise: 0.0,
+            phases: 0,
+            outline,
+            is_settled: false,
+        }
+    }
+
+    /// At this loss and pose.
+    fn stand(&mut self, standing: (f64, Pose6)) {
+        (self.loss, self.pose) = standing;
+        // A NaN must not win; something near the largest f32 is what a descent holds that never had another.
+        if self.loss.is_nan() || self.loss > 1e38 {
+            self.loss = f64::INFINITY;
+        }
+    }
+
+    /// Which of two is the better one at the end: what has settled is what was found; else more phases before fewer, then by loss.
+    fn behind(&self, other: &Self) -> Ordering {
+        let settled = other.is_settled.cmp(&self.is_settled);
+        settled.then(other.phases.cmp(&self.phases)).then(self.loss.total_cmp(&other.loss))
     }
 }
 
@@ -162,6 +192,7 @@ pub fn estimate(
         hypotheses = course.last_phase_anew(late)?;
         hypotheses.extend(rest);
     }
+    course.settle(&mut hypotheses)?;
     Ok((0..queries.len()).map(|query| course.estimate(query, &hypotheses)).collect())
 }
 
@@ -357,7 +388,7 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
     /// What is known of a query at the end.
     fn estimate(&self, query: usize, hypotheses: &[Hypothesis]) -> Estimate {
         let mut own: Vec<&Hypothesis> = hypotheses.iter().filter(|h| h.query == query).collect();
-        own.sort_by(|a, b| b.phases.cmp(&a.phases).then(a.loss.total_cmp(&b.loss)));
+        own.sort_by(|a, b| a.behind(b));
         let ranked = |h: &&Hypothesis| Ranked { start: h.start, loss: h.loss, phases: h.phases, pose: h.pose };
         let &Hypothesis { pose, loss, curvature, .. } = own[0];
         let (light, outline, of_query) = (self.lights[query], self.outlines[query], query);
@@ -407,23 +438,23 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
             let poses: Vec<Pose6> = standing.iter().map(|(_, pose)| *pose).collect();
             descent.set_poses(&poses)?;
             descent.evaluate()?;
-            for (h, (curvature, gradient)) in zip(&mut *running, zip(descent.curvatures()?, descent.gradients()?)) {
-                (h.curvature, h.promise) = (Some(curvature), promise(&curvature, &gradient));
-            }
+            learn_curvatures(&mut descent, running)?;
         }
-        for (hypothesis, standing) in zip(running, standing) {
-            (hypothesis.loss, hypothesis.pose) = standing;
-            // A NaN must not win; something near the largest f32 is what a descent holds that never had another.
-            if hypothesis.loss.is_nan() || hypothesis.loss > 1e38 {
-                hypothesis.loss = f64::INFINITY;
-            }
-        }
+        zip(running, standing).for_each(|(hypothesis, standing)| hypothesis.stand(standing));
         Ok(())
     }
 
     fn observe(&mut self, hypotheses: &[(usize, usize)], descent: &mut Descent) -> Result<(), Error> {
         (self.observe)(Progress { step: self.step, steps: self.steps, search: 0, hypotheses, descent })
     }
+}
+
+/// What second derivatives say at the poses that a descent has begun from.
+fn learn_curvatures(descent: &mut Descent, hypotheses: &mut [Hypothesis]) -> Result<(), Error> {
+    for (h, (curvature, gradient)) in zip(hypotheses, zip(descent.curvatures()?, descent.gradients()?)) {
+        (h.curvature, h.promise) = (Some(curvature), promise(&curvature, &gradient));
+    }
+    Ok(())
 }
 
 /// A hypothesis at each pose that a closer look at it tries, see [`Phase::closer_look`].

@@ -49,6 +49,9 @@ pub struct Options {
     /// How many times the last phase begins anew, at most, for images whose poses have not arrived: where the second derivatives there promise a loss that
     /// is lower than the best by more than a hundredth. With BFGS only.
     pub anew: u32,
+    /// Rounds in which the best of each image is taken from where its loss is least to where it is least in the mean over what lies around, as far as it rises by half a
+    /// hundredth: which of several minima side by side a descent ends in, rounding decides. With BFGS only.
+    pub settle: u32,
     /// Seed of the initial depths of Adam's rays. With BFGS all begin at the mean depth: random ones change the losses of hypotheses by half a
     /// thousandth, as much as those of minima side by side differ.
     pub seed: u64,
@@ -74,14 +77,15 @@ impl Default for Options {
 
 impl Options {
     /// BFGS: a look at all starts, a closer one around the best, steps for the most promising ones on few rays, then for the best on more, and for the best few on
-    /// all, until they stand still: the loss has minima side by side. Then once more with new second derivatives: where a valley is flat and
-    /// full of kinks, those that steps have learnt leave a pose a tenth of a degree before its end. These two make up for the light, and before them masks
-    /// are tried with other outlines. And on so for those that have not arrived: most have, in a number of steps that would be too small for some.
+    /// all, until they stand still; before these, which make up for the light, masks are tried with other outlines. And on so, with new second derivatives, for those that
+    /// have not arrived: most have, in a number of steps that would be too small for some. The loss has minima side by side: at last the best settles in their midst. A fast
+    /// search does not; it goes on a little with new second derivatives, without which a pose is left a tenth of a degree before the end of a valley that is flat and full of
+    /// kinks.
     pub fn of(effort: Effort) -> Self {
-        let (min_starts, descents) = match effort {
-            Effort::Fast => (84, [(0, 12), (6, 6), (6, 2), (5, 1), (5, 1), (3, 1)]),
-            Effort::Normal => (84, [(0, 24), (8, 16), (8, 6), (6, 1), (16, 3), (6, 3)]),
-            Effort::Exhaustive => (168, [(0, 96), (10, 64), (10, 20), (6, 6), (18, 6), (6, 6)]),
+        let (min_starts, descents, settle): (_, &[_], _) = match effort {
+            Effort::Fast => (84, &[(0, 12), (6, 6), (6, 2), (5, 1), (5, 1), (3, 1)], 0),
+            Effort::Normal => (84, &[(0, 24), (8, 16), (8, 6), (6, 1), (16, 3)], 3),
+            Effort::Exhaustive => (168, &[(0, 96), (10, 64), (10, 20), (6, 6), (18, 6), (6, 6)], 3),
         };
         let look = Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, closer_look: false, outlines: false };
         let closer_look = Phase { closer_look: true, ..look };
@@ -94,9 +98,9 @@ impl Options {
             in_the_light(1),
             in_the_light(1),
         ];
-        let phase = |(kind, (steps, keep))| Phase { steps, keep, ..kind };
+        let phase = |(kind, &(steps, keep))| Phase { steps, keep, ..kind };
         let phases = iter::once(look).chain(zip(kinds, descents).map(phase)).collect();
-        Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, align: true, phases, anew: 6, seed: 0 }
+        Options { method: Method::Bfgs { soft: 0.3, grain: GRAIN }, min_starts, align: true, phases, anew: 6, settle, seed: 0 }
     }
 
     /// The paper's settings: Adam at 0.1, 300 steps for every start, all pixels, MAE, last step.
@@ -108,16 +112,18 @@ impl Options {
             align: false,
             phases: vec![Phase { steps: 300, stride: 1, keep: usize::MAX, light: false, closer_look: false, outlines: false }],
             anew: 0,
+            settle: 0,
             seed: 0,
         }
     }
 
-    /// The same with `steps` steps in all, none anew, shared between the phases in their present proportions; those that try outlines have as many more or fewer,
+    /// The same with `steps` steps in all, none anew and without settling, shared between the phases in their present proportions; those that try outlines have as many more or fewer,
     /// and come on top. Where there are any at all, a phase whose share is none is left out.
     pub fn with_steps(mut self, steps: u32) -> Self {
-        self.anew = 0;
+        (self.anew, self.settle) = (0, 0);
         let total = self.phases.iter().filter(|phase| !phase.outlines).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
-        let share = |of: u64| (2 * of * u64::from(steps) + total) / (2 * total);
+        // Half a step is one of the later phase.
+        let share = |of: u64| (2 * of * u64::from(steps) + total - 1) / (2 * total);
         let (mut before, mut done) = (0, 0);
         self.phases.retain_mut(|phase| {
             let present = u64::from(phase.steps);
@@ -190,7 +196,7 @@ mod tests {
             assert_eq!(all(&default.clone().with_steps(steps)), steps);
         }
         let total = all(&default);
-        assert_eq!(default.clone().with_steps(total), Options { anew: 0, ..default.clone() });
+        assert_eq!(default.clone().with_steps(total), Options { anew: 0, settle: 0, ..default.clone() });
         // A look at all starts and a closer one, outlines, and the phase that has the step.
         let one: Vec<(u32, u32)> = default.clone().with_steps(1).phases.iter().map(|phase| (phase.steps, phase.stride)).collect();
         assert_eq!(one, [(0, 4), (0, 4), (0, 2), (1, 1)]);

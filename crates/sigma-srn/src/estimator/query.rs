@@ -7,6 +7,7 @@ use glam::{DMat4, DVec2};
 
 use super::align::hidden_side;
 use super::options::{Options, Phase};
+use super::settle::AT_ONCE;
 use crate::camera::{Intrinsics, Pose6};
 use crate::mask::{Outline, has_outline, known, outlines, with_outline};
 use crate::model::Model;
@@ -146,7 +147,9 @@ impl Query {
             let tried = if phase.outlines { outlines().count() } else { 1 } * if phase.closer_look { CLOSER_LOOKS } else { 1 };
             tried * starts.len().min(self.keep(phase)) * self.rays(phase.stride).count()
         });
-        look.into_iter().chain(others).max().unwrap_or(0)
+        let last = options.phases.last().filter(|_| options.settle > 0);
+        let settling = last.map(|last| AT_ONCE * self.rays(last.stride).count());
+        look.into_iter().chain(others).chain(settling).max().unwrap_or(0)
     }
 
     /// Says what is wrong with it.

@@ -122,6 +122,27 @@ impl Targets {
         Some(Targets { shape, instances, slots, rays, rgb, weights: Some(counts) })
     }
 
+    /// The same for so many hypotheses in the place of each.
+    pub fn repeated(&self, times: usize) -> Self {
+        let rays = self.rays_per_image();
+        fn repeat<T: Copy>(all: &[T], of_each: usize, times: usize) -> Vec<T> {
+            all.chunks(of_each).flat_map(|own| own.repeat(times)).collect()
+        }
+        Targets {
+            shape: Shape { hypotheses: self.shape.hypotheses * times as u32, ..self.shape },
+            instances: self.instances.clone(),
+            slots: repeat(&self.slots, 1, times),
+            rays: Rays {
+                world_from_camera: repeat(&self.rays.world_from_camera, 1, times),
+                intrinsics: repeat(&self.rays.intrinsics, 1, times),
+                uv: repeat(&self.rays.uv, 2 * rays, times),
+                z0: repeat(&self.rays.z0, rays, times),
+            },
+            rgb: repeat(&self.rgb, 3 * rays, times),
+            weights: self.weights.as_ref().map(|weights| repeat(weights, rays, times)),
+        }
+    }
+
     /// At the hypotheses' poses; from there they move, or are only compared.
     pub fn descent(
         &self,
@@ -140,6 +161,34 @@ impl Targets {
     }
 }
 
+/// What the hypotheses of a phase are compared with, and the light of each query that is made up for. `looks_closer`: on the rays alone that are worth their time.
+pub(super) fn seen_by(
+    engine: &Engine,
+    model: &Model,
+    queries: &[Query],
+    options: &Options,
+    phase: &Phase,
+    looks_closer: bool,
+    running: &[Hypothesis],
+) -> Result<(Targets, Vec<Option<Light>>), Error> {
+    let mut targets = Targets::new(queries, options, phase, running);
+    let mut lights = vec![None; queries.len()];
+    let is_made_up = |query: &Query| phase.light && query.coverage.is_some() || options.has_own_lights(query);
+    let makes_up = queries.iter().any(is_made_up);
+    if makes_up || looks_closer {
+        let mut views = targets.descent(engine, model, options.method, false, running)?;
+        views.compare()?;
+        let renders = views.rgb()?;
+        if makes_up {
+            lights = targets.undo_lights(queries, phase, running, &renders, is_made_up);
+        }
+        if looks_closer {
+            targets = targets.in_regions(&renders).unwrap_or(targets);
+        }
+    }
+    Ok((targets, lights))
+}
+
 /// The descent of a phase, whose poses move or are only compared, and the light of each query that it makes up for.
 pub(super) fn prepare(
     engine: &Engine,
@@ -150,24 +199,10 @@ pub(super) fn prepare(
     is_moving: bool,
     running: &[Hypothesis],
 ) -> Result<(Descent, Vec<Option<Light>>), Error> {
-    let mut targets = Targets::new(queries, options, phase, running);
-    let method = options.method.with_stride(phase.stride);
-    let mut lights = vec![None; queries.len()];
-    let is_made_up = |query: &Query| phase.light && query.coverage.is_some() || options.has_own_lights(query);
-    let makes_up = queries.iter().any(is_made_up);
     // The paper's way compares whole images.
-    let looks_closer = phase.steps > 0 && matches!(method, Method::Bfgs { .. });
-    if makes_up || looks_closer {
-        let mut views = targets.descent(engine, model, method, false, running)?;
-        views.compare()?;
-        let renders = views.rgb()?;
-        if makes_up {
-            lights = targets.undo_lights(queries, phase, running, &renders, is_made_up);
-        }
-        if looks_closer {
-            targets = targets.in_regions(&renders).unwrap_or(targets);
-        }
-    }
+    let looks_closer = phase.steps > 0 && matches!(options.method, Method::Bfgs { .. });
+    let (targets, lights) = seen_by(engine, model, queries, options, phase, looks_closer, running)?;
+    let method = options.method.with_stride(phase.stride);
     Ok((targets.descent(engine, model, method, is_moving, running)?, lights))
 }
 

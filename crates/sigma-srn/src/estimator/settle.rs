@@ -1,0 +1,262 @@
+//! The end of a search. The loss has kinks, and so minima side by side, tenths of a degree apart, whose losses differ by thousandths: which of them a descent
+//! ends in is decided by rounding. Its mean over a neighbourhood has one minimum there.
+
+use std::array;
+use std::iter::{self, zip};
+
+use glam::DMat4;
+
+use super::targets::seen_by;
+use super::{Course, Hypothesis, Phase, Progress, learn_curvatures};
+use crate::Error;
+use crate::camera::Pose6;
+use crate::cholesky::{backward, cholesky, solve};
+use crate::confidence::{Matrix6, moved};
+use crate::random::{normal, stream};
+
+/// By which part of it the loss rises from a pose to those that are tried around it.
+const RISES: f64 = 0.005;
+
+/// How much farther away those are whose second derivatives say, in the mean, how far that is: at one pose alone they would differ from one minimum to the next.
+const WIDER: f64 = 1.5;
+
+/// Poses that are tried around one: to either side along six directions.
+const AROUND: usize = 12;
+
+/// And the one in their midst: how many hypotheses of an image there are side by side.
+pub(super) const AT_ONCE: usize = 1 + AROUND;
+
+/// By which part settling may raise the loss.
+const MOST: f64 = 2.0 * RISES;
+
+/// The best pose of an image, and gradients around it.
+struct Surroundings {
+    best: Hypothesis,
+    origin: DMat4,
+    /// `L`, where `L Lᵀ` are second derivatives of the loss over what it may rise by: a motion `L⁻ᵀ u` with a `u` of length 1 takes it as far up.
+    lower: Matrix6,
+    /// The motion to where the least loss is known to be.
+    here: [f64; 6],
+    /// Motions to where gradients are known, and these.
+    known: Vec<([f64; 6], [f64; 6])>,
+}
+
+impl Surroundings {
+    /// `None` where the loss has no minimum.
+    fn new(best: Hypothesis) -> Option<Self> {
+        let rise = 2.0 * RISES * best.loss;
+        let lower = cholesky(&best.curvature?.map(|row| row.map(|entry| entry / rise)))?;
+        Some(Surroundings { best, origin: best.pose.to_matrix(), lower, here: [0.0; 6], known: vec![] })
+    }
+
+    /// Motions to around where the least loss is known to be, behind the one to there.
+    fn around(&self, directions: &[[f64; 6]; AROUND], by: f64) -> Vec<[f64; 6]> {
+        let to = |u: &[f64; 6]| {
+            let motion = backward(&self.lower, u.map(|x| by * x));
+            array::from_fn(|k| self.here[k] + motion[k])
+        };
+        iter::once(self.here).chain(directions.iter().map(to)).collect()
+    }
+
+    fn hypothesis(&self, motion: &[f64; 6]) -> Hypothesis {
+        Hypothesis { pose: Pose6::from_matrix(&moved(&self.origin, motion)), ..self.best }
+    }
+
+    /// Takes the mean of some second derivatives for what they are all around.
+    fn set_curvature(&mut self, all: &[Matrix6]) {
+        let rise = 2.0 * RISES * self.best.loss * all.len() as f64;
+        let mean = |i: usize, j: usize| all.iter().map(|c| c[i][j]).sum::<f64>() / rise;
+        let mean = array::from_fn(|i| array::from_fn(|j| mean(i, j)));
+        self.lower = cholesky(&mean).unwrap_or(self.lower);
+    }
+
+    /// Learns gradients, and goes to where, in the mean, they vanish.
+    fn learn(&mut self, motions: &[[f64; 6]], gradients: &[[f64; 6]]) {
+        // Where a kink is in their midst, it counts no more than any other.
+        self.known.extend(zip(motions, gradients).skip(1).map(|(motion, gradient)| (*motion, *gradient)));
+        let Some((gradient, second)) = self.fit() else { return };
+        let by = solve(&second, gradient.map(|x| -x));
+        // Not beyond what is known.
+        let length = product(&self.lower, &by).iter().map(|x| x * x).sum::<f64>().sqrt().max(1.0);
+        self.here = array::from_fn(|k| self.here[k] + by[k] / length);
+    }
+
+    /// The mean gradient, and the factor of mean second derivatives: by least squares, gradients are `a + B (motion - here)`, where those count that are near.
+    fn fit(&self) -> Option<([f64; 6], Matrix6)> {
+        let (mut squares, mut right) = ([[0.0; 7]; 7], [[0.0; 7]; 6]);
+        for (motion, gradient) in &self.known {
+            let u = product(&self.lower, &array::from_fn(|k| motion[k] - self.here[k]));
+            let weight = (-u.iter().map(|x| x * x).sum::<f64>()).exp();
+            let row: [f64; 7] = array::from_fn(|k| if k == 0 { 1.0 } else { u[k - 1] });
+            for i in 0..7 {
+                (0..7).for_each(|j| squares[i][j] += weight * row[i] * row[j]);
+                (0..6).for_each(|j| right[j][i] += weight * row[i] * gradient[j]);
+            }
+        }
+        let factor = cholesky(&squares)?;
+        let fit = right.map(|right| solve(&factor, right));
+        // Rows are over u: B = M Lᵀ.
+        let over_motion: Matrix6 = fit.map(|row| array::from_fn(|j| (0..6).map(|k| row[1 + k] * self.lower[j][k]).sum()));
+        let mut second: Matrix6 = array::from_fn(|i| array::from_fn(|j| 0.5 * (over_motion[i][j] + over_motion[j][i])));
+        if second.iter().flatten().any(|entry| !entry.is_finite()) {
+            return None;
+        }
+        // Between two minima they need not be positive.
+        let more = 0.25 * 2.0 * RISES * self.best.loss;
+        let known: Matrix6 =
+            array::from_fn(|i| array::from_fn(|j| (0..6).map(|k| self.lower[i][k] * self.lower[j][k]).sum::<f64>()));
+        loop {
+            if let Some(factor) = cholesky(&second) {
+                return Some((fit.map(|row| row[0]), factor));
+            }
+            (0..6).for_each(|i| (0..6).for_each(|j| second[i][j] += more * known[i][j]));
+        }
+    }
+}
+
+/// `Lᵀ x`.
+fn product(lower: &Matrix6, x: &[f64; 6]) -> [f64; 6] {
+    array::from_fn(|i| (i..6).map(|k| lower[k][i] * x[k]).sum())
+}
+
+impl<F: FnMut(Progress) -> Result<(), Error>> Course<'_, F> {
+    /// Takes the best hypothesis of each image to where the loss around it is least, see [`Options::settle`](super::Options::settle).
+    pub(super) fn settle(&mut self, hypotheses: &mut [Hypothesis]) -> Result<(), Error> {
+        let Course { engine, model, queries, options, .. } = *self;
+        let Some(phase) = self.last.map(|last| &options.phases[last]) else { return Ok(()) };
+        let best = |query: usize| hypotheses.iter().filter(|h| h.query == query).min_by(|a, b| a.behind(b)).copied();
+        let mut all: Vec<Surroundings> = (0..queries.len()).filter_map(best).filter_map(Surroundings::new).collect();
+        if options.settle == 0 || all.is_empty() {
+            return Ok(());
+        }
+        let centres: Vec<Hypothesis> = all.iter().map(|of| of.best).collect();
+        let around = |all: &[Surroundings], round: u32, by: f64| {
+            let directions = directions(options.seed, round);
+            all.iter().map(|of| of.around(&directions, by)).collect::<Vec<_>>()
+        };
+        let tried = |all: &[Surroundings], motions: &[Vec<[f64; 6]>]| {
+            zip(all, motions).flat_map(|(of, motions)| motions.iter().map(|motion| of.hypothesis(motion))).collect::<Vec<_>>()
+        };
+        // How far is far needs few rays.
+        let twice = Phase { stride: 2 * phase.stride, ..*phase };
+        let coarse = if queries.iter().all(|query| query.sees(twice.stride)) { &twice } else { phase };
+        let (targets, _) = seen_by(engine, model, queries, options, coarse, true, &centres)?;
+        let first = tried(&all, &around(&all, 0, WIDER));
+        let mut descent = targets.repeated(AT_ONCE).descent(engine, model, options.method, true, &first)?;
+        descent.evaluate()?;
+        for (of, curvatures) in zip(&mut all, descent.curvatures()?.chunks(AT_ONCE)) {
+            of.set_curvature(curvatures);
+        }
+
+        let (targets, lights) = seen_by(engine, model, queries, options, phase, true, &centres)?;
+        centres.iter().for_each(|h| self.lights[h.query] = lights[h.query]);
+        let mut descent = targets.repeated(AT_ONCE).descent(engine, model, options.method, true, &first)?;
+        for round in 1..=options.settle {
+            let motions = around(&all, round, 1.0);
+            let poses: Vec<Pose6> = tried(&all, &motions).iter().map(|h| h.pose).collect();
+            let gradients = descent.gradients_at(&poses)?;
+            for ((of, motions), gradients) in zip(&mut all, &motions).zip(gradients.chunks(AT_ONCE)) {
+                of.learn(motions, gradients);
+            }
+        }
+        let mut settled: Vec<Hypothesis> =
+            all.iter().map(|of| Hypothesis { is_settled: true, ..of.hypothesis(&of.here) }).collect();
+        let names: Vec<(usize, usize)> = settled.iter().map(|h| (h.query, h.start)).collect();
+        let mut descent = targets.descent(engine, model, options.method, true, &settled)?;
+        (self.step, self.steps) = (self.step + 1, self.steps + 1);
+        descent.evaluate()?;
+        self.observe(&names, &mut descent)?;
+        learn_curvatures(&mut descent, &mut settled)?;
+        zip(&mut settled, descent.standing()?).for_each(|(h, standing)| h.stand(standing));
+        for (of, settled) in zip(&all, settled) {
+            let is_it = |h: &&mut Hypothesis| (h.query, h.start) == (settled.query, settled.start);
+            if let Some(found) = hypotheses.iter_mut().find(is_it)
+                && settled.loss <= (1.0 + MOST) * of.best.loss
+            {
+                *found = settled;
+            }
+        }
+        Ok(())
+    }
+}
+/// To either side along six directions at right angles, others in each round.
+fn directions(seed: u64, round: u32) -> [[f64; 6]; AROUND] {
+    let mut random = stream(seed, round.into());
+    // A reflection takes the axes to them.
+    let mirror: [f64; 6] = array::from_fn(|_| normal(&mut random));
+    let squares: f64 = mirror.iter().map(|x| x * x).sum();
+    array::from_fn(|number| {
+        let (k, sign) = (number / 2, if number % 2 == 0 { 1.0 } else { -1.0 });
+        array::from_fn(|i| sign * (f64::from(i == k) - 2.0 * mirror[k] * mirror[i] / squares))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::look_at_origin;
+    use crate::confidence::motion;
+    use crate::mask::Outline;
+
+    #[test]
+    fn directions_are_at_right_angles_and_others_in_each_round() {
+        let all: Vec<[f64; 6]> = (0..2).flat_map(|round| directions(7, round)).collect();
+        let dot = |a: &[f64; 6], b: &[f64; 6]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+        for i in 0..AROUND {
+            for j in 0..AROUND {
+                let expected = if i == j {
+                    1.0
+                } else if i / 2 == j / 2 {
+                    -1.0
+                } else {
+                    0.0
+                };
+                assert!((dot(&all[i], &all[j]) - expected).abs() < 1e-12, "{i} {j}");
+            }
+            assert!(all[AROUND..].iter().all(|other| dot(&all[i], other).abs() < 0.999));
+        }
+    }
+
+    /// A valley with minima side by side: wherever a descent ends in it, it settles in the middle.
+    #[test]
+    fn what_has_ended_in_one_of_several_minima_settles_in_their_midst() {
+        let scales = [0.3, 0.6, 2.0, 40.0, 60.0, 10.0];
+        let middle = look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
+        let curvature: Matrix6 = array::from_fn(|i| array::from_fn(|j| if i == j { scales[i] } else { 0.02 }));
+        // Ripples along every axis, a third as long as the neighbourhood: the gradient changes its sign several times.
+        let loss = 2e-3f64;
+        let gradient = |pose: &DMat4| -> [f64; 6] {
+            let x = motion(&middle, pose);
+            array::from_fn(|i| {
+                let length = (2.0 * RISES * loss / scales[i]).sqrt() / 3.0;
+                let slope: f64 = (0..6).map(|k| curvature[i][k] * x[k]).sum();
+                slope + 0.6 * scales[i] * length * (6.0 * x[i] / length).sin()
+            })
+        };
+        let off = |of: &Surroundings| {
+            let x = motion(&middle, &moved(&of.origin, &of.here));
+            product(&of.lower, &x).iter().map(|x| x * x).sum::<f64>().sqrt()
+        };
+        for side in [-1.0, 0.2, 0.7] {
+            let from = moved(&middle, &array::from_fn(|i| side * 0.6 * (2.0 * RISES * loss / scales[i]).sqrt()));
+            let best = Hypothesis {
+                loss,
+                curvature: Some(curvature),
+                ..Hypothesis::new(0, 0, Pose6::from_matrix(&from), Outline::AS_GIVEN)
+            };
+            let mut of = Surroundings::new(best).unwrap();
+            of.set_curvature(&[curvature; 3]);
+            let before = off(&of);
+            for round in 1..=3 {
+                let motions = of.around(&directions(0, round), 1.0);
+                let gradients: Vec<[f64; 6]> = motions.iter().map(|motion| gradient(&moved(&of.origin, motion))).collect();
+                of.learn(&motions, &gradients);
+            }
+            println!("{before:.3} {:.3}", off(&of));
+            assert!(off(&of) < 0.2, "{side}: {before} {}", off(&of));
+        }
+        let flat = Hypothesis { curvature: None, ..Hypothesis::new(0, 0, Pose6::from_matrix(&middle), Outline::AS_GIVEN) };
+        assert!(Surroundings::new(flat).is_none());
+        assert!(Surroundings::new(Hypothesis { curvature: Some([[f64::NAN; 6]; 6]), ..flat }).is_none());
+    }
+}
