@@ -29,6 +29,9 @@ pub(super) const AT_ONCE: usize = 1 + AROUND;
 /// By which part settling may raise the loss.
 const MOST: f64 = 2.0 * RISES;
 
+/// How many quarters of what second derivatives are expected to be are added at most until they are those of a minimum.
+const MOST_QUARTERS: usize = 40;
+
 /// The best pose of an image, and gradients around it.
 struct Surroundings {
     best: Hypothesis,
@@ -98,19 +101,17 @@ impl Surroundings {
         // Rows are over u: B = M Lᵀ.
         let over_motion: Matrix6 = fit.map(|row| array::from_fn(|j| (0..6).map(|k| row[1 + k] * self.lower[j][k]).sum()));
         let mut second: Matrix6 = array::from_fn(|i| array::from_fn(|j| 0.5 * (over_motion[i][j] + over_motion[j][i])));
-        if second.iter().flatten().any(|entry| !entry.is_finite()) {
-            return None;
-        }
         // Between two minima they need not be positive.
-        let more = 0.25 * 2.0 * RISES * self.best.loss;
-        let known: Matrix6 =
-            array::from_fn(|i| array::from_fn(|j| (0..6).map(|k| self.lower[i][k] * self.lower[j][k]).sum::<f64>()));
-        loop {
+        let quarter = 0.25 * 2.0 * RISES * self.best.loss;
+        let expected = |i: usize, j: usize| (0..6).map(|k| self.lower[i][k] * self.lower[j][k]).sum::<f64>();
+        let more: Matrix6 = array::from_fn(|i| array::from_fn(|j| quarter * expected(i, j)));
+        for _ in 0..MOST_QUARTERS {
             if let Some(factor) = cholesky(&second) {
                 return Some((fit.map(|row| row[0]), factor));
             }
-            (0..6).for_each(|i| (0..6).for_each(|j| second[i][j] += more * known[i][j]));
+            zip(second.as_flattened_mut(), more.as_flattened()).for_each(|(entry, more)| *entry += more);
         }
+        None
     }
 }
 
