@@ -3,6 +3,7 @@
 use std::iter::zip;
 
 use glam::{DMat4, DVec2, DVec3, DVec4};
+use sigma_srn::photo::Shot;
 use sigma_srn::{
     Descent, Engine, Estimate, Intrinsics, Loss, Method, Model, ModelConfig, Options, Outline, Phase, Pose6, Query, Rays,
     Renderer, Shape, Train, Trainer, TrainingBatch,
@@ -739,16 +740,9 @@ fn searches_settle_between_minima() {
     let spoiled = |(k, c): (usize, &f32)| if *c < 0.99 { (c + 0.4 * (k as f32 * 0.7).sin()).clamp(-1.0, 1.0) } else { *c };
     let rgb: Vec<f32> = shown.iter().enumerate().map(spoiled).collect();
     let search = |settle: u32, by: f64| {
-        let query = |k: usize| Query {
-            instance,
-            rgb: rgb[k * values..][..values].to_vec(),
-            weights: None,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            width: SIDE,
-            height: SIDE,
-            intrinsics,
-            starts: vec![DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.1 + by) * truths[k]],
+        let query = |k: usize| {
+            let start = DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.1 + by) * truths[k];
+            Shot::whole(rgb[k * values..][..values].to_vec(), intrinsics, instance, SIDE).query(vec![start])
         };
         let queries: Vec<Query> = (0..24).map(query).collect();
         let phases = vec![Phase { steps: 24, stride: 1, keep: 3, light: false, closer_look: false, outlines: false }];
