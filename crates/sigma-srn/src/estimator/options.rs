@@ -122,8 +122,8 @@ impl Options {
     pub fn with_steps(mut self, steps: u32) -> Self {
         (self.anew, self.settle) = (0, 0);
         let total = self.phases.iter().filter(|phase| !phase.outlines).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
-        // Half a step is one of the later phase.
-        let share = |of: u64| (2 * of * u64::from(steps) + total - 1) / (2 * total);
+        // A part of a step is of the later phase, so that a single one is with all rays.
+        let share = |of: u64| of * u64::from(steps) / total;
         let (mut before, mut done) = (0, 0);
         self.phases.retain_mut(|phase| {
             let present = u64::from(phase.steps);
