@@ -84,7 +84,7 @@ impl Options {
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents, settle): (_, &[_], _) = match effort {
             Effort::Fast => (84, &[(0, 12), (6, 6), (6, 2), (5, 1), (5, 1), (3, 1)], 0),
-            Effort::Normal => (84, &[(0, 24), (8, 16), (10, 4), (6, 1), (8, 2)], 3),
+            Effort::Normal => (84, &[(0, 24), (8, 16), (8, 6), (6, 1), (16, 3)], 3),
             Effort::Exhaustive => (168, &[(0, 96), (10, 64), (10, 20), (6, 6), (18, 6), (6, 6)], 3),
         };
         let look = Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, closer_look: false, outlines: false };
@@ -122,8 +122,8 @@ impl Options {
     pub fn with_steps(mut self, steps: u32) -> Self {
         (self.anew, self.settle) = (0, 0);
         let total = self.phases.iter().filter(|phase| !phase.outlines).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
-        // A part of a step is of the later phase, so that a single one is with all rays.
-        let share = |of: u64| of * u64::from(steps) / total;
+        // Half a step is one of the later phase.
+        let share = |of: u64| (2 * of * u64::from(steps) + total - 1) / (2 * total);
         let (mut before, mut done) = (0, 0);
         self.phases.retain_mut(|phase| {
             let present = u64::from(phase.steps);
