@@ -192,17 +192,7 @@ fn light_is_made_up_for() {
             };
             let rgb = view.iter().enumerate().map(light).collect();
             let (coverage, starts) = (is_known.then_some(coverage), vec![turn * truths[k]]);
-            Query {
-                instance,
-                rgb,
-                weights: None,
-                coverage,
-                outline: Outline::AS_GIVEN,
-                width: SIDE,
-                height: SIDE,
-                intrinsics,
-                starts,
-            }
+            Query { coverage, ..Shot::whole(rgb, intrinsics, instance, SIDE).query(starts) }
         };
         let phases =
             [10, 10].map(|steps| Phase { steps, stride: 1, keep: 1, light: true, closer_look: false, outlines: false }).into();
@@ -228,17 +218,7 @@ fn light_is_made_up_for() {
     let wrong = |coverage: Vec<f32>| {
         let (rgb, starts) = (vec![0.0; 3 * (SIDE * SIDE) as usize], camera::fixed24(1.3));
         let coverage = Some(coverage);
-        let query = Query {
-            instance,
-            rgb,
-            weights: None,
-            coverage,
-            outline: Outline::AS_GIVEN,
-            width: SIDE,
-            height: SIDE,
-            intrinsics,
-            starts,
-        };
+        let query = Query { coverage, ..Shot::whole(rgb, intrinsics, instance, SIDE).query(starts) };
         estimate(&Engine::cpu(), model, &[query], &Options::default(), |_| Ok(())).unwrap_err().to_string()
     };
     assert!(wrong(vec![0.5; 7]).contains("coverage of 784"));
@@ -261,9 +241,9 @@ fn starts_are_aligned_with_what_is_cut_out() {
         let start = start * DMat4::from_rotation_y(0.06);
         let phases = vec![Phase { steps: 0, stride: 1, keep: 1, light: false, closer_look: false, outlines: false }];
         let options = Options { phases, min_starts: 0, ..Options::default() };
-        let query = |coverage: Option<Vec<f32>>| {
-            let (rgb, width, height, starts) = (shown.rgb.clone(), SIDE, SIDE, vec![start]);
-            Query { instance, rgb, weights: None, coverage, outline: Outline::AS_GIVEN, width, height, intrinsics, starts }
+        let query = |coverage: Option<Vec<f32>>| Query {
+            coverage,
+            ..Shot::whole(shown.rgb.clone(), intrinsics, instance, SIDE).query(vec![start])
         };
         let queries = [query(None), query(Some(coverage))];
         let errors = |options: &Options| {
@@ -292,9 +272,7 @@ fn a_closer_look_goes_on_from_where_it_looks_best() {
         let starts = [turn(0, truths[0].x_axis), turn(1, truths[1].y_axis), turn(2, -truths[2].z_axis), nearer(truths[3])];
         let worse = |start: DMat4| DMat4::from_axis_angle(start.x_axis.truncate(), 0.5) * start;
         let query = |(rgb, start): (&[f32], DMat4)| {
-            let (rgb, starts) = (rgb.to_vec(), vec![start, worse(start)]);
-            let (weights, coverage, outline) = (None, None, Outline::AS_GIVEN);
-            Query { instance, rgb, weights, coverage, outline, width: SIDE, height: SIDE, intrinsics, starts }
+            Shot::whole(rgb.to_vec(), intrinsics, instance, SIDE).query(vec![start, worse(start)])
         };
         let queries: Vec<Query> = zip(shown.rgb.chunks(shown.rgb.len() / 4), starts).map(query).collect();
         let errors = |closer_look: bool| {
@@ -324,8 +302,7 @@ fn what_has_not_arrived_goes_on() {
         let rgb: Vec<f32> = zip(&shown.rgb, 0..).map(|(colour, k)| colour + 0.1 * ((k * k) as f32).sin()).collect();
         let query = |off: f64| {
             let starts = vec![DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), off) * truth];
-            let (rgb, width, height) = (rgb.clone(), SIDE, SIDE);
-            Query { instance, rgb, weights: None, coverage: None, outline: Outline::AS_GIVEN, width, height, intrinsics, starts }
+            Shot::whole(rgb.clone(), intrinsics, instance, SIDE).query(starts)
         };
         let options = |anew: u32| {
             let phases = vec![Phase { steps: 4, stride: 1, keep: 1, light: false, closer_look: false, outlines: false }];
@@ -383,8 +360,8 @@ fn forklift_cut_out() -> (Model, Query, DMat4) {
     let coverage = Some(rgb.chunks(3).map(|pixel| f32::from(u8::from(is_object(pixel)))).collect());
     let rgb = rgb.chunks(3).flat_map(|pixel| if is_object(pixel) { pixel.to_vec() } else { vec![1.0; 3] });
     let (rgb, starts) = (rgb.map(|colour| colour.clamp(-1.0, 1.0)).collect(), vec![DMat4::from_rotation_z(0.05) * truth]);
-    let (width, height, outline) = (SIDE, SIDE, Outline::AS_GIVEN);
-    (model, Query { instance, rgb, weights: None, coverage, outline, width, height, intrinsics, starts }, truth)
+    let query = Query { coverage, ..Shot::whole(rgb, intrinsics, instance, SIDE).query(starts) };
+    (model, query, truth)
 }
 
 /// Where steps at all pixels lead; other outlines are tried in these phases or not.
@@ -462,17 +439,7 @@ fn masks_are_tried_dilated() {
         let (rgb, coverage) = with_rim(&shown.rgb, side);
         let query = |coverage: Option<&Vec<f32>>| {
             let (rgb, coverage, starts) = (rgb.clone(), coverage.cloned(), vec![camera::fixed24(1.3)[10], truth]);
-            Query {
-                instance,
-                rgb,
-                weights: None,
-                coverage,
-                outline: Outline::AS_GIVEN,
-                width: SIDE,
-                height: SIDE,
-                intrinsics,
-                starts,
-            }
+            Query { coverage, ..Shot::whole(rgb, intrinsics, instance, SIDE).query(starts) }
         };
         let phase = |steps, keep, outlines| Phase { steps, stride: 1, keep, light: false, closer_look: false, outlines };
         let phases = vec![phase(0, 2, false), phase(2, 1, true), phase(1, 2, false)];
@@ -539,17 +506,7 @@ fn an_object_is_found_without_its_name() {
         };
         let rgb = rendered(model, instance);
         let starts = vec![DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.1) * truth];
-        let query = Query {
-            instance: 99,
-            rgb,
-            weights: None,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            width: SIDE,
-            height: SIDE,
-            intrinsics: intrinsics(),
-            starts,
-        };
+        let query = Shot::whole(rgb, intrinsics(), 99, SIDE).query(starts);
         let mut turns = Vec::new();
         let found = estimate_unseen(&engine, model, &query, 0, |turn, turns_in_all| {
             turns.push((turn, turns_in_all));
@@ -583,18 +540,7 @@ fn the_code_of_an_unknown_object_does_not_see_what_does_not_count() {
             rgb[3 * pixel..][..3].fill(behind);
         }
         let (weights, starts) = (Some(weights.clone()), vec![truth]);
-        let [width, height] = [SIDE; 2];
-        let query = Query {
-            instance: 0,
-            rgb,
-            weights,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            width,
-            height,
-            intrinsics: intrinsics(),
-            starts,
-        };
+        let query = Query { weights, ..Shot::whole(rgb, intrinsics(), 0, SIDE).query(starts) };
         let found = estimate_unseen(&engine, trainer.model().unwrap(), &query, 0, |_, _| Ok(())).unwrap();
         (found.estimate.pose, found.estimate.loss, found.model)
     };
@@ -612,17 +558,7 @@ fn second_derivatives_are_those_of_the_place() {
     let truth = camera::fixed24(1.3)[1];
     let rgb = picture(1, &truth);
     let starts = vec![DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.2) * truth];
-    let query = Query {
-        instance: 1,
-        rgb,
-        weights: None,
-        coverage: None,
-        outline: Outline::AS_GIVEN,
-        width: SIDE,
-        height: SIDE,
-        intrinsics: intrinsics(),
-        starts,
-    };
+    let query = Shot::whole(rgb, intrinsics(), 1, SIDE).query(starts);
     for engine in engines() {
         let phases = vec![Phase { steps: 15, stride: 1, keep: 1, light: false, closer_look: false, outlines: false }];
         let options = Options { phases, min_starts: 0, settle: 0, seed: 0, ..Options::default() };
@@ -661,17 +597,8 @@ fn hypotheses_of_one_pose_have_one_loss() {
     let (ref model, instance, intrinsics) = shipped_forklift();
     for engine in engines() {
         let start = camera::fixed24(1.3)[5];
-        let query = Query {
-            instance,
-            rgb: (0..3 * SIDE * SIDE).map(|k| (k as f32 * 0.7).sin()).collect(),
-            weights: None,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            width: SIDE,
-            height: SIDE,
-            intrinsics,
-            starts: vec![start; 3],
-        };
+        let rgb = (0..3 * SIDE * SIDE).map(|k| (k as f32 * 0.7).sin()).collect();
+        let query = Shot::whole(rgb, intrinsics, instance, SIDE).query(vec![start; 3]);
         let losses = |options: Options| {
             let phases = vec![Phase { steps: 0, stride: 1, keep: usize::MAX, light: false, closer_look: false, outlines: false }];
             let options = Options { phases, min_starts: 0, ..options };
@@ -698,17 +625,7 @@ fn rounding_does_not_part_searches() {
         let rgb = shown.chunks(shown.len() / 24).nth(k).unwrap().iter().map(|c| (by * c).clamp(-1.0, 1.0)).collect();
         let turn = DMat4::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.3);
         let starts = vec![turn * truths[k]];
-        Query {
-            instance,
-            rgb,
-            weights: None,
-            coverage: None,
-            outline: Outline::AS_GIVEN,
-            width: SIDE,
-            height: SIDE,
-            intrinsics,
-            starts,
-        }
+        Shot::whole(rgb, intrinsics, instance, SIDE).query(starts)
     };
     let together = |grain: f32| {
         let options = Options { method: Method::Bfgs { soft: 0.3, grain }, min_starts: 0, settle: 0, ..Options::default() };
@@ -789,17 +706,7 @@ fn white_costs_nothing() {
         let query = |k: usize| {
             let rgb = shown.chunks(shown.len() / 2).nth(k).unwrap().iter().map(|c| c.clamp(-1.0, 1.0)).collect();
             let starts = vec![turn * truths[k]];
-            Query {
-                instance,
-                rgb,
-                weights: None,
-                coverage: None,
-                outline: Outline::AS_GIVEN,
-                width: SIDE,
-                height: SIDE,
-                intrinsics,
-                starts,
-            }
+            Shot::whole(rgb, intrinsics, instance, SIDE).query(starts)
         };
         let search = |queries: &[Query], steps: u32| {
             let phases = vec![Phase { steps, stride: 1, keep: 1, light: false, closer_look: false, outlines: false }];
@@ -848,15 +755,8 @@ fn what_does_not_count_has_no_influence() {
     (0..RAYS as usize).filter(|&pixel| hidden(pixel)).for_each(|pixel| occluded[3 * pixel..][..3].fill(-1.0));
     let mask: Vec<f32> = (0..RAYS as usize).map(|pixel| if hidden(pixel) { 0.0 } else { 1.0 }).collect();
     let query = |rgb: &[f32], weights: Option<&[f32]>| Query {
-        instance: 1,
-        rgb: rgb.to_vec(),
         weights: weights.map(<[f32]>::to_vec),
-        coverage: None,
-        outline: Outline::AS_GIVEN,
-        width: SIDE,
-        height: SIDE,
-        intrinsics: intrinsics(),
-        starts: camera::neighbor4(&truth),
+        ..Shot::whole(rgb.to_vec(), intrinsics(), 1, SIDE).query(camera::neighbor4(&truth))
     };
     let adam = |loss| Method::Adam { loss, learning_rate: 0.01 };
     let methods = [Loss::Mae, Loss::NormL2].map(adam).into_iter().chain([Method::Bfgs { soft: 0.3, grain: 0.0 }]);

@@ -1,6 +1,7 @@
 //! Cooperative matrices, on a device that has them: used where they hardly change gradients, and only there.
 
-use sigma_srn::{Engine, Gpu, Intrinsics, Method, Model, Options, Outline, Phase, Query, Renderer, camera, estimate};
+use sigma_srn::photo::Shot;
+use sigma_srn::{Engine, Gpu, Intrinsics, Method, Model, Options, Phase, Renderer, camera, estimate};
 use srn_gpu::Choice;
 use srn_tests::{cooperative_gpu, gpu};
 
@@ -15,17 +16,7 @@ fn found(engine: &Engine) -> (f64, f64) {
     let rendering = Renderer::new(&Engine::cpu(), model, 1, SIDE, SIDE).unwrap().render(&[1], &[(truth, intrinsics)], 0).unwrap();
     let turn = glam::DMat4::from_axis_angle(glam::DVec3::new(0.6, 0.0, 0.8), 0.2);
     let starts = vec![turn * truth];
-    let query = Query {
-        instance: 1,
-        intrinsics,
-        width: SIDE,
-        height: SIDE,
-        rgb: rendering.rgb,
-        weights: None,
-        coverage: None,
-        outline: Outline::AS_GIVEN,
-        starts,
-    };
+    let query = Shot::whole(rendering.rgb, intrinsics, 1, SIDE).query(starts);
     let phases = vec![Phase { steps: 30, stride: 1, keep: usize::MAX, light: false, closer_look: false, outlines: false }];
     let options = Options {
         method: Method::Bfgs { soft: 1.0, grain: 0.0 },

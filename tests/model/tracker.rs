@@ -1,6 +1,7 @@
 //! From frame to frame: what is followed, what is lost and found again, and what is known of the frames' masks.
 
 use glam::{DMat4, DVec3};
+use sigma_srn::photo::Shot;
 use sigma_srn::{Doubt, Effort, Engine, Intrinsics, Options, Outline, Query, Renderer, Search, Tracked, Tracker, camera};
 
 use super::behaviour::{shipped_forklift, with_rim};
@@ -28,7 +29,7 @@ fn an_object_is_followed_and_found_again() {
         // Where to search for what is lost, some way off; what is not lost is not looked for there.
         let starts = vec![DMat4::from_rotation_z(-0.2) * *camera];
         let outline = Outline { dilation: 9.0, ..Outline::AS_GIVEN };
-        Query { instance, rgb, weights: None, coverage, outline, width: SIDE, height: SIDE, intrinsics, starts }
+        Query { coverage, outline, ..Shot::whole(rgb, intrinsics, instance, SIDE).query(starts) }
     };
     let error = |found: &Tracked, truth: &DMat4| camera::pose_error(&found.found.world_from_camera, truth).0;
     let search = Search { accept: Some(0.25), ..Search::from(Options { min_starts: 0, ..Options::of(Effort::Fast) }) };
