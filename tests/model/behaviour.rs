@@ -674,7 +674,7 @@ fn searches_settle_between_minima() {
         assert!(found.iter().all(|found| found.ranking[0].loss == found.loss && found.ranking[0].pose == found.pose));
         found
     };
-    let ends = [0, 3].map(|settle| [-0.01, 0.01].map(|by| search(settle, by)));
+    let ends = [0, 12].map(|settle| [-0.01, 0.01].map(|by| search(settle, by)));
     let apart = |[one, other]: &[Vec<Estimate>; 2]| {
         let angle = |(a, b): (&Estimate, &Estimate)| camera::pose_error(&a.pose.to_matrix(), &b.pose.to_matrix()).0;
         zip(one, other).map(angle).collect::<Vec<_>>()
@@ -689,7 +689,7 @@ fn searches_settle_between_minima() {
         0.5 * (all[11] + all[12])
     };
     let (found, settled) = (middle(found), middle(settled));
-    assert!(settled < 0.7 * found, "{found} {settled}");
+    assert!(settled < 0.6 * found, "{found} {settled}");
 }
 
 /// Where neither the picture nor the view shows anything, no rays are cast: the loss is that of the whole picture all the same, and hypotheses that show

@@ -301,18 +301,6 @@ impl Descent {
         }
     }
 
-    /// Gradients at other poses by one way back, from which no step follows: the descent begins anew with [`Descent::set_poses`]. None where poses are only
-    /// compared.
-    pub(crate) fn gradients_at(&mut self, poses: &[Pose6]) -> Result<Vec<[f64; 6]>, Error> {
-        self.set_poses(poses)?;
-        let stage = self.evaluation();
-        self.runner.run(stage)?;
-        match self.by() {
-            Some(By::Bfgs { gradient, .. }) => Ok(six_numbers(&self.runner.read(gradient)?)),
-            Some(By::Adam { .. }) | None => self.gradients(),
-        }
-    }
-
     /// Where each hypothesis stands, with its loss there: Adam at its last step, BFGS at its best.
     pub fn standing(&mut self) -> Result<Vec<(f64, Pose6)>, Error> {
         let Some(states) = self.states()? else { return Ok(zip(self.losses()?, self.poses()?).collect()) };

@@ -101,7 +101,7 @@ pub struct Progress<'a> {
     pub steps: u32,
     /// Searches that have gone before, where several follow one another: see [`Search`](crate::Search).
     pub search: usize,
-    /// `(query, start)` of each hypothesis in the running phase.
+    /// `(query, start)` of each hypothesis in the running phase; none while the best settle, see [`Options::settle`].
     pub hypotheses: &'a [(usize, usize)],
     /// The running descent; reading from it waits for the device. With BFGS its rays are no whole image, but those near what is to be seen.
     pub descent: &'a mut Descent,

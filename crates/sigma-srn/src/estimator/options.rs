@@ -49,8 +49,8 @@ pub struct Options {
     /// How many times the last phase begins anew, at most, for images whose poses have not arrived: where the second derivatives there promise a loss that
     /// is lower than the best by more than a hundredth. With BFGS only.
     pub anew: u32,
-    /// Rounds in which the best of each image is taken from where its loss is least to where it is least in the mean over what lies around, as far as it rises by half a
-    /// hundredth: which of several minima side by side a descent ends in, rounding decides. With BFGS only.
+    /// Rounds in which the best of each image is taken from where its loss is least to the minimum of the quadratic function that comes nearest to losses all around, as far as
+    /// they rise by half a hundredth: which of several minima side by side a descent ends in, rounding decides. Each takes twelve views; fewer than ten do not suffice. With BFGS only.
     pub settle: u32,
     /// Seed of the initial depths of Adam's rays. With BFGS all begin at the mean depth: random ones change the losses of hypotheses by half a
     /// thousandth, as much as those of minima side by side differ.
@@ -84,8 +84,8 @@ impl Options {
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents, settle): (_, &[_], _) = match effort {
             Effort::Fast => (84, &[(0, 12), (6, 6), (6, 2), (5, 1), (5, 1), (3, 1)], 0),
-            Effort::Normal => (84, &[(0, 24), (8, 16), (8, 6), (6, 1), (16, 3)], 3),
-            Effort::Exhaustive => (168, &[(0, 96), (10, 64), (10, 20), (6, 6), (18, 6), (6, 6)], 3),
+            Effort::Normal => (84, &[(0, 24), (8, 16), (8, 6), (6, 1), (8, 3)], 12),
+            Effort::Exhaustive => (168, &[(0, 96), (10, 64), (10, 20), (6, 6), (18, 6), (6, 6)], 12),
         };
         let look = Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, closer_look: false, outlines: false };
         let closer_look = Phase { closer_look: true, ..look };
@@ -122,8 +122,8 @@ impl Options {
     pub fn with_steps(mut self, steps: u32) -> Self {
         (self.anew, self.settle) = (0, 0);
         let total = self.phases.iter().filter(|phase| !phase.outlines).map(|phase| u64::from(phase.steps)).sum::<u64>().max(1);
-        // Half a step is one of the later phase.
-        let share = |of: u64| (2 * of * u64::from(steps) + total - 1) / (2 * total);
+        // A part of a step is one of the later phase: a single one is the last phase's.
+        let share = |of: u64| of * u64::from(steps) / total;
         let (mut before, mut done) = (0, 0);
         self.phases.retain_mut(|phase| {
             let present = u64::from(phase.steps);

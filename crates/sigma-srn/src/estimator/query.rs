@@ -7,7 +7,7 @@ use glam::{DMat4, DVec2};
 
 use super::align::hidden_side;
 use super::options::{Options, Phase};
-use super::settle::AT_ONCE;
+use super::settle::AROUND;
 use crate::camera::{Intrinsics, Pose6};
 use crate::mask::{Outline, has_outline, known, outlines, with_outline};
 use crate::model::Model;
@@ -148,7 +148,7 @@ impl Query {
             tried * starts.len().min(self.keep(phase)) * self.rays(phase.stride).count()
         });
         let last = options.phases.last().filter(|_| options.settle > 0);
-        let settling = last.map(|last| AT_ONCE * self.rays(last.stride).count());
+        let settling = last.map(|last| AROUND * self.rays(last.stride).count());
         look.into_iter().chain(others).chain(settling).max().unwrap_or(0)
     }
 

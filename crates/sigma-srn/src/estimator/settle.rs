@@ -1,8 +1,8 @@
 //! The end of a search. The loss has kinks, and so minima side by side, tenths of a degree apart, whose losses differ by thousandths: which of them a descent
-//! ends in is decided by rounding. Its mean over a neighbourhood has one minimum there.
+//! ends in is decided by rounding. Of losses all around one quadratic function comes nearest, and that has one minimum. (Not of gradients: at a kink those jump, losses do not.)
 
 use std::array;
-use std::iter::{self, zip};
+use std::iter::zip;
 
 use glam::DMat4;
 
@@ -20,11 +20,17 @@ const RISES: f64 = 0.005;
 /// How much farther away those are whose second derivatives say, in the mean, how far that is: at one pose alone they would differ from one minimum to the next.
 const WIDER: f64 = 1.5;
 
-/// Poses that are tried around one: to either side along six directions.
-const AROUND: usize = 12;
+/// Poses that are tried around one, all at once: to either side along six directions.
+pub(super) const AROUND: usize = 12;
 
-/// And the one in their midst: how many hypotheses of an image there are side by side.
-pub(super) const AT_ONCE: usize = 1 + AROUND;
+/// How fast poses lose weight: at this distance from the least loss, squared, they count 1/e. Losses rise by [`RISES`] over a distance of 1.
+const REACH: f64 = 3.0;
+
+/// How much what second derivatives are expected to be counts beside losses, which of the first rounds are too few to tell all of them.
+const EXPECTED: f64 = 0.1;
+
+/// What a quadratic function of six numbers consists of: a constant, first and second derivatives.
+const COEFFICIENTS: usize = 1 + 6 + 21;
 
 /// By which part settling may raise the loss.
 const MOST: f64 = 2.0 * RISES;
@@ -32,7 +38,7 @@ const MOST: f64 = 2.0 * RISES;
 /// How many quarters of what second derivatives are expected to be are added at most until they are those of a minimum.
 const MOST_QUARTERS: usize = 40;
 
-/// The best pose of an image, and gradients around it.
+/// The best pose of an image, and losses around it.
 struct Surroundings {
     best: Hypothesis,
     origin: DMat4,
@@ -40,8 +46,8 @@ struct Surroundings {
     lower: Matrix6,
     /// The motion to where the least loss is known to be.
     here: [f64; 6],
-    /// Motions to where gradients are known, and these.
-    known: Vec<([f64; 6], [f64; 6])>,
+    /// Motions to where losses are known, and these.
+    known: Vec<([f64; 6], f64)>,
 }
 
 impl Surroundings {
@@ -52,13 +58,12 @@ impl Surroundings {
         Some(Surroundings { best, origin: best.pose.to_matrix(), lower, here: [0.0; 6], known: vec![] })
     }
 
-    /// Motions to around where the least loss is known to be, behind the one to there.
-    fn around(&self, directions: &[[f64; 6]; AROUND], by: f64) -> Vec<[f64; 6]> {
-        let to = |u: &[f64; 6]| {
+    /// Motions to around where the least loss is known to be.
+    fn around(&self, directions: &[[f64; 6]; AROUND], by: f64) -> [[f64; 6]; AROUND] {
+        directions.map(|u| {
             let motion = backward(&self.lower, u.map(|x| by * x));
             array::from_fn(|k| self.here[k] + motion[k])
-        };
-        iter::once(self.here).chain(directions.iter().map(to)).collect()
+        })
     }
 
     fn hypothesis(&self, motion: &[f64; 6]) -> Hypothesis {
@@ -73,43 +78,47 @@ impl Surroundings {
         self.lower = cholesky(&mean).unwrap_or(self.lower);
     }
 
-    /// Learns gradients, and goes to where, in the mean, they vanish.
-    fn learn(&mut self, motions: &[[f64; 6]], gradients: &[[f64; 6]]) {
-        // Where a kink is in their midst, it counts no more than any other.
-        self.known.extend(zip(motions, gradients).skip(1).map(|(motion, gradient)| (*motion, *gradient)));
-        let Some((gradient, second)) = self.fit() else { return };
-        let by = solve(&second, gradient.map(|x| -x));
+    /// Learns losses, and goes to where a quadratic function that is near them has its minimum.
+    fn learn(&mut self, motions: &[[f64; 6]], losses: &[f64]) {
+        self.known.extend(zip(motions.iter().copied(), losses.iter().copied()));
+        let Some((gradient, factor)) = self.fit() else { return };
+        let by = solve(&factor, gradient.map(|x| -x));
         // Not beyond what is known.
-        let length = product(&self.lower, &by).iter().map(|x| x * x).sum::<f64>().sqrt().max(1.0);
-        self.here = array::from_fn(|k| self.here[k] + by[k] / length);
+        let length = by.iter().map(|x| x * x).sum::<f64>().sqrt().max(1.0);
+        let motion = backward(&self.lower, by.map(|x| x / length));
+        zip(&mut self.here, motion).for_each(|(here, by)| *here += by);
     }
 
-    /// The mean gradient, and the factor of mean second derivatives: by least squares, gradients are `a + B (motion - here)`, where those count that are near.
+    /// The gradient, and the factor of the second derivatives, over `u` (see `lower`), of the quadratic function that comes nearest to the losses, where those count that are near.
     fn fit(&self) -> Option<([f64; 6], Matrix6)> {
-        let (mut squares, mut right) = ([[0.0; 7]; 7], [[0.0; 7]; 6]);
-        for (motion, gradient) in &self.known {
+        let pairs = || (0..6).flat_map(|i| (i..6).map(move |j| (i, j)));
+        let (mut squares, mut right) = ([[0.0; COEFFICIENTS]; COEFFICIENTS], [0.0; COEFFICIENTS]);
+        for (k, (i, j)) in (7..).zip(pairs()) {
+            squares[k][k] = EXPECTED;
+            right[k] = if i == j { EXPECTED } else { 0.0 };
+        }
+        for (motion, loss) in &self.known {
             let u = product(&self.lower, &array::from_fn(|k| motion[k] - self.here[k]));
-            let weight = (-u.iter().map(|x| x * x).sum::<f64>()).exp();
-            let row: [f64; 7] = array::from_fn(|k| if k == 0 { 1.0 } else { u[k - 1] });
-            for i in 0..7 {
-                (0..7).for_each(|j| squares[i][j] += weight * row[i] * row[j]);
-                (0..6).for_each(|j| right[j][i] += weight * row[i] * gradient[j]);
+            let weight = (-u.iter().map(|x| x * x).sum::<f64>() / REACH).exp();
+            let mut row = [1.0; COEFFICIENTS];
+            row[1..7].copy_from_slice(&u);
+            zip(&mut row[7..], pairs()).for_each(|(entry, (i, j))| *entry = u[i] * u[j] * if i == j { 0.5 } else { 1.0 });
+            // Of the numbers that they are multiples of for their second derivatives to be 1 where they are as expected.
+            let loss = (loss - self.best.loss) / (2.0 * RISES * self.best.loss);
+            for i in 0..COEFFICIENTS {
+                (0..COEFFICIENTS).for_each(|j| squares[i][j] += weight * row[i] * row[j]);
+                right[i] += weight * row[i] * loss;
             }
         }
-        let factor = cholesky(&squares)?;
-        let fit = right.map(|right| solve(&factor, right));
-        // Rows are over u: B = M Lᵀ.
-        let over_motion: Matrix6 = fit.map(|row| array::from_fn(|j| (0..6).map(|k| row[1 + k] * self.lower[j][k]).sum()));
-        let mut second: Matrix6 = array::from_fn(|i| array::from_fn(|j| 0.5 * (over_motion[i][j] + over_motion[j][i])));
+        let fit = solve(&cholesky(&squares)?, right);
+        let mut second = [[0.0; 6]; 6];
+        zip(&fit[7..], pairs()).for_each(|(&entry, (i, j))| (second[i][j], second[j][i]) = (entry, entry));
         // Between two minima they need not be positive.
-        let quarter = 0.25 * 2.0 * RISES * self.best.loss;
-        let expected = |i: usize, j: usize| (0..6).map(|k| self.lower[i][k] * self.lower[j][k]).sum::<f64>();
-        let more: Matrix6 = array::from_fn(|i| array::from_fn(|j| quarter * expected(i, j)));
         for _ in 0..MOST_QUARTERS {
             if let Some(factor) = cholesky(&second) {
-                return Some((fit.map(|row| row[0]), factor));
+                return Some((array::from_fn(|k| fit[1 + k]), factor));
             }
-            zip(second.as_flattened_mut(), more.as_flattened()).for_each(|(entry, more)| *entry += more);
+            (0..6).for_each(|k| second[k][k] += 0.25);
         }
         None
     }
@@ -135,7 +144,7 @@ impl<F: FnMut(Progress) -> Result<(), Error>> Course<'_, F> {
             let directions = directions(options.seed, round);
             all.iter().map(|of| of.around(&directions, by)).collect::<Vec<_>>()
         };
-        let tried = |all: &[Surroundings], motions: &[Vec<[f64; 6]>]| {
+        let tried = |all: &[Surroundings], motions: &[[[f64; 6]; AROUND]]| {
             zip(all, motions).flat_map(|(of, motions)| motions.iter().map(|motion| of.hypothesis(motion))).collect::<Vec<_>>()
         };
         // How far is far needs few rays.
@@ -143,29 +152,33 @@ impl<F: FnMut(Progress) -> Result<(), Error>> Course<'_, F> {
         let coarse = if queries.iter().all(|query| query.sees(twice.stride)) { &twice } else { phase };
         let (targets, _) = seen_by(engine, model, queries, options, coarse, true, &centres)?;
         let first = tried(&all, &around(&all, 0, WIDER));
-        let mut descent = targets.repeated(AT_ONCE).descent(engine, model, options.method, true, &first)?;
+        let mut descent = targets.repeated(AROUND).descent(engine, model, options.method, true, &first)?;
         descent.evaluate()?;
-        for (of, curvatures) in zip(&mut all, descent.curvatures()?.chunks(AT_ONCE)) {
+        for (of, curvatures) in zip(&mut all, descent.curvatures()?.chunks(AROUND)) {
             of.set_curvature(curvatures);
         }
 
         let (targets, lights) = seen_by(engine, model, queries, options, phase, true, &centres)?;
         centres.iter().for_each(|h| self.lights[h.query] = lights[h.query]);
-        let mut descent = targets.repeated(AT_ONCE).descent(engine, model, options.method, true, &first)?;
+        let mut descent = targets.repeated(AROUND).descent(engine, model, options.method, false, &first)?;
+        self.steps += options.settle + 1;
         for round in 1..=options.settle {
             let motions = around(&all, round, 1.0);
             let poses: Vec<Pose6> = tried(&all, &motions).iter().map(|h| h.pose).collect();
-            let gradients = descent.gradients_at(&poses)?;
-            for ((of, motions), gradients) in zip(&mut all, &motions).zip(gradients.chunks(AT_ONCE)) {
-                of.learn(motions, gradients);
+            descent.set_poses(&poses)?;
+            descent.compare()?;
+            for ((of, motions), losses) in zip(&mut all, &motions).zip(descent.losses()?.chunks(AROUND)) {
+                of.learn(motions, losses);
             }
+            self.step += 1;
+            self.observe(&[], &mut descent)?;
         }
         let mut settled: Vec<Hypothesis> =
             all.iter().map(|of| Hypothesis { is_settled: true, ..of.hypothesis(&of.here) }).collect();
         let names: Vec<(usize, usize)> = settled.iter().map(|h| (h.query, h.start)).collect();
         let mut descent = targets.descent(engine, model, options.method, true, &settled)?;
-        (self.step, self.steps) = (self.step + 1, self.steps + 1);
         descent.evaluate()?;
+        self.step += 1;
         self.observe(&names, &mut descent)?;
         learn_curvatures(&mut descent, &mut settled)?;
         zip(&mut settled, descent.standing()?).for_each(|(h, standing)| h.stand(standing));
@@ -225,33 +238,33 @@ mod tests {
         let middle = look_at_origin(glam::DVec3::new(0.9, -0.7, 0.6));
         let curvature: Matrix6 = array::from_fn(|i| array::from_fn(|j| if i == j { scales[i] } else { 0.02 }));
         // Ripples along every axis, a third as long as the neighbourhood: the gradient changes its sign several times.
-        let loss = 2e-3f64;
-        let gradient = |pose: &DMat4| -> [f64; 6] {
+        let least = 2e-3f64;
+        let rippled = |pose: &DMat4| -> f64 {
             let x = motion(&middle, pose);
-            array::from_fn(|i| {
-                let length = (2.0 * RISES * loss / scales[i]).sqrt() / 3.0;
+            let along = |i: usize| {
+                let length = (2.0 * RISES * least / scales[i]).sqrt() / 3.0;
                 let slope: f64 = (0..6).map(|k| curvature[i][k] * x[k]).sum();
-                slope + 0.6 * scales[i] * length * (6.0 * x[i] / length).sin()
-            })
+                0.5 * x[i] * slope - 0.1 * scales[i] * length.powi(2) * (6.0 * x[i] / length).cos()
+            };
+            least + (0..6).map(along).sum::<f64>()
         };
         let off = |of: &Surroundings| {
             let x = motion(&middle, &moved(&of.origin, &of.here));
             product(&of.lower, &x).iter().map(|x| x * x).sum::<f64>().sqrt()
         };
         for side in [-1.0, 0.2, 0.7] {
-            let from = moved(&middle, &array::from_fn(|i| side * 0.6 * (2.0 * RISES * loss / scales[i]).sqrt()));
+            let from = moved(&middle, &array::from_fn(|i| side * 0.6 * (2.0 * RISES * least / scales[i]).sqrt()));
             let best = Hypothesis {
-                loss,
+                loss: least,
                 curvature: Some(curvature),
                 ..Hypothesis::new(0, 0, Pose6::from_matrix(&from), Outline::AS_GIVEN)
             };
             let mut of = Surroundings::new(best).unwrap();
             of.set_curvature(&[curvature; 3]);
             let before = off(&of);
-            for round in 1..=3 {
+            for round in 1..=12 {
                 let motions = of.around(&directions(0, round), 1.0);
-                let gradients: Vec<[f64; 6]> = motions.iter().map(|motion| gradient(&moved(&of.origin, motion))).collect();
-                of.learn(&motions, &gradients);
+                of.learn(&motions, &motions.map(|motion| rippled(&moved(&of.origin, &motion))));
             }
             println!("{before:.3} {:.3}", off(&of));
             assert!(off(&of) < 0.2, "{side}: {before} {}", off(&of));
