@@ -103,7 +103,7 @@ impl Surroundings {
             let mut row = [1.0; COEFFICIENTS];
             row[1..7].copy_from_slice(&u);
             zip(&mut row[7..], pairs()).for_each(|(entry, (i, j))| *entry = u[i] * u[j] * if i == j { 0.5 } else { 1.0 });
-            // Of the numbers that they are multiples of for their second derivatives to be 1 where they are as expected.
+            // In units in which the expected second derivatives are 1.
             let loss = (loss - self.best.loss) / (2.0 * RISES * self.best.loss);
             for i in 0..COEFFICIENTS {
                 (0..COEFFICIENTS).for_each(|j| squares[i][j] += weight * row[i] * row[j]);
@@ -193,6 +193,7 @@ impl<F: FnMut(Progress) -> Result<(), Error>> Course<'_, F> {
         Ok(())
     }
 }
+
 /// To either side along six directions at right angles, others in each round.
 fn directions(seed: u64, round: u32) -> [[f64; 6]; AROUND] {
     let mut random = stream(seed, round.into());
