@@ -15,7 +15,7 @@ use crate::confidence::{Matrix6, moved};
 use crate::random::{normal, stream};
 
 /// By which part of it the loss rises from a pose to those that are tried around it.
-const RISES: f64 = 0.005;
+const RISES: f64 = 0.02;
 
 /// How much farther away those are whose second derivatives say, in the mean, how far that is: at one pose alone they would differ from one minimum to the next.
 const WIDER: f64 = 1.5;
