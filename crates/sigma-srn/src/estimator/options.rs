@@ -84,7 +84,7 @@ impl Options {
     pub fn of(effort: Effort) -> Self {
         let (min_starts, descents, settle): (_, &[_], _) = match effort {
             Effort::Fast => (84, &[(0, 12), (6, 6), (6, 2), (5, 1), (5, 1), (3, 1)], 0),
-            Effort::Normal => (84, &[(0, 24), (8, 16), (8, 6), (6, 1), (8, 3)], 12),
+            Effort::Normal => (84, &[(0, 24), (8, 12), (8, 4), (6, 1), (6, 2)], 12),
             Effort::Exhaustive => (168, &[(0, 96), (10, 64), (10, 20), (6, 6), (18, 6), (6, 6)], 12),
         };
         let look = Phase { steps: 0, stride: 4, keep: usize::MAX, light: false, closer_look: false, outlines: false };
