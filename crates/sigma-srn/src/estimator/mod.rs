@@ -19,6 +19,7 @@ use self::look::look;
 pub use self::options::{Effort, Options, Phase};
 pub use self::query::Query;
 use self::query::{CLOSER_LOOKS, TURN_DEG, closer_looks, turned};
+use self::settle::settling_steps;
 use self::targets::prepare;
 use crate::Error;
 use crate::camera::Pose6;
@@ -264,7 +265,7 @@ impl<'a, F: FnMut(Progress) -> Result<(), Error>> Course<'a, F> {
             lights: vec![None; queries.len()],
             outlines: queries.iter().map(|query| query.has_outline().then_some(query.outline)).collect(),
             step: 0,
-            steps: options.phases.iter().filter(runs).map(|phase| phase.steps).sum(),
+            steps: options.phases.iter().filter(runs).map(|phase| phase.steps).sum::<u32>() + settling_steps(options),
             observe,
         }
     }

@@ -7,7 +7,7 @@ use std::iter::zip;
 use glam::DMat4;
 
 use super::targets::seen_by;
-use super::{Course, Hypothesis, Phase, Progress, learn_curvatures};
+use super::{Course, Hypothesis, Options, Phase, Progress, learn_curvatures};
 use crate::Error;
 use crate::camera::Pose6;
 use crate::cholesky::{backward, cholesky, solve};
@@ -33,7 +33,7 @@ const EXPECTED: f64 = 0.1;
 const COEFFICIENTS: usize = 1 + 6 + 21;
 
 /// By which part settling may raise the loss.
-const MOST: f64 = 2.0 * RISES;
+const MOST: f64 = RISES;
 
 /// How many quarters of what second derivatives are expected to be are added at most until they are those of a minimum.
 const MOST_QUARTERS: usize = 40;
@@ -129,16 +129,21 @@ fn product(lower: &Matrix6, x: &[f64; 6]) -> [f64; 6] {
     array::from_fn(|i| (i..6).map(|k| lower[k][i] * x[k]).sum())
 }
 
+/// A step for each round, and one to see where they have led.
+pub(super) fn settling_steps(options: &Options) -> u32 {
+    if options.settle > 0 { options.settle + 1 } else { 0 }
+}
+
 impl<F: FnMut(Progress) -> Result<(), Error>> Course<'_, F> {
     /// Takes the best hypothesis of each image to where the loss around it is least, see [`Options::settle`](super::Options::settle).
     pub(super) fn settle(&mut self, hypotheses: &mut [Hypothesis]) -> Result<(), Error> {
         let Course { engine, model, queries, options, .. } = *self;
-        let Some(phase) = self.last.map(|last| &options.phases[last]) else { return Ok(()) };
         let best = |query: usize| hypotheses.iter().filter(|h| h.query == query).min_by(|a, b| a.behind(b)).copied();
         let mut all: Vec<Surroundings> = (0..queries.len()).filter_map(best).filter_map(Surroundings::new).collect();
-        if options.settle == 0 || all.is_empty() {
+        let Some(phase) = self.last.map(|last| &options.phases[last]).filter(|_| options.settle > 0 && !all.is_empty()) else {
+            self.steps -= settling_steps(options);
             return Ok(());
-        }
+        };
         let centres: Vec<Hypothesis> = all.iter().map(|of| of.best).collect();
         let around = |all: &[Surroundings], round: u32, by: f64| {
             let directions = directions(options.seed, round);
@@ -161,7 +166,6 @@ impl<F: FnMut(Progress) -> Result<(), Error>> Course<'_, F> {
         let (targets, lights) = seen_by(engine, model, queries, options, phase, true, &centres)?;
         centres.iter().for_each(|h| self.lights[h.query] = lights[h.query]);
         let mut descent = targets.repeated(AROUND).descent(engine, model, options.method, false, &first)?;
-        self.steps += options.settle + 1;
         for round in 1..=options.settle {
             let motions = around(&all, round, 1.0);
             let poses: Vec<Pose6> = tried(&all, &motions).iter().map(|h| h.pose).collect();
@@ -173,21 +177,28 @@ impl<F: FnMut(Progress) -> Result<(), Error>> Course<'_, F> {
             self.step += 1;
             self.observe(&[], &mut descent)?;
         }
-        let mut settled: Vec<Hypothesis> =
-            all.iter().map(|of| Hypothesis { is_settled: true, ..of.hypothesis(&of.here) }).collect();
-        let names: Vec<(usize, usize)> = settled.iter().map(|h| (h.query, h.start)).collect();
-        let mut descent = targets.descent(engine, model, options.method, true, &settled)?;
+        let settled = all.iter().map(|of| Hypothesis { is_settled: true, ..of.hypothesis(&of.here) });
+        let mut found: Vec<Hypothesis> = settled.collect();
+        let mut descent = targets.descent(engine, model, options.method, true, &found)?;
         descent.evaluate()?;
+        let losses = descent.losses()?;
+        let rises = |of: &Surroundings, loss: f64| loss.is_nan() || loss > (1.0 + MOST) * of.best.loss;
+        if zip(&all, &losses).any(|(of, &loss)| rises(of, loss)) {
+            for ((found, of), &loss) in zip(&mut found, &all).zip(&losses) {
+                *found = if rises(of, loss) { of.best } else { *found };
+            }
+            descent.set_poses(&found.iter().map(|h| h.pose).collect::<Vec<_>>())?;
+            descent.evaluate()?;
+        }
         self.step += 1;
+        let names: Vec<(usize, usize)> = found.iter().map(|h| (h.query, h.start)).collect();
         self.observe(&names, &mut descent)?;
-        learn_curvatures(&mut descent, &mut settled)?;
-        zip(&mut settled, descent.standing()?).for_each(|(h, standing)| h.stand(standing));
-        for (of, settled) in zip(&all, settled) {
-            let is_it = |h: &&mut Hypothesis| (h.query, h.start) == (settled.query, settled.start);
-            if let Some(found) = hypotheses.iter_mut().find(is_it)
-                && settled.loss <= (1.0 + MOST) * of.best.loss
-            {
-                *found = settled;
+        learn_curvatures(&mut descent, &mut found)?;
+        zip(&mut found, descent.standing()?).for_each(|(h, standing)| h.stand(standing));
+        for found in found {
+            let is_it = |h: &&mut Hypothesis| (h.query, h.start) == (found.query, found.start);
+            if let Some(best) = hypotheses.iter_mut().find(is_it) {
+                *best = found;
             }
         }
         Ok(())
