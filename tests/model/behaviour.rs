@@ -643,7 +643,7 @@ fn rounding_does_not_part_searches() {
 }
 
 /// Pictures that no view of the model explains have minima side by side, between which descents that differ by rounding choose. Settled, they end together, at losses no
-/// more than a hundredth higher, and the best stays the first.
+/// more than two hundredths higher, and the best stays the first.
 #[test]
 fn searches_settle_between_minima() {
     let (ref model, instance, intrinsics) = shipped_forklift();
@@ -682,7 +682,7 @@ fn searches_settle_between_minima() {
     let [found, settled] = ends.each_ref().map(apart);
     println!("{found:.3?}, settled {settled:.3?}");
     for (found, settled) in zip(ends[0].iter().flatten(), ends[1].iter().flatten()) {
-        assert!(settled.loss < 1.0101 * found.loss, "{} {}", settled.loss, found.loss);
+        assert!(settled.loss < 1.0201 * found.loss, "{} {}", settled.loss, found.loss);
     }
     let middle = |mut all: Vec<f64>| {
         all.sort_by(f64::total_cmp);

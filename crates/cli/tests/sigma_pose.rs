@@ -153,8 +153,8 @@ fn presets_and_losses_are_heard() {
     assert_eq!(phases("--preset paper --steps 10 --cull --loss norm_l1"), 8);
     assert_eq!(phases("--preset paper --steps 2 --loss gmsd"), 4);
     assert_eq!(phases("--steps 6 --no-cull"), 4 * 5);
-    // Of 28 the four that fall out at the first look are not named. Six wait while masks would be tried, if there were one.
-    assert_eq!(phases("--steps 6"), 24 + 24 + 16 + 6 + 6 + 3);
+    // Of 28 the four that fall out at the first look are not named. Four wait while masks would be tried, if there were one.
+    assert_eq!(phases("--steps 6"), 24 + 24 + 12 + 4 + 4 + 2);
 }
 
 /// A calibrated model says how far off its poses may be; the file keeps everything else.
