@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use crate::picture::read_mask;
 use crate::pixels::open_with_opacity;
 use crate::srn::Intrinsics;
-use srn_photo::{BoundingBox, Known, Photo, Pixels, Square};
+use srn_photo::{BoundingBox, Known, Photo, Square};
 use std::path::Path;
 
 /// What of a photograph is the object.
@@ -19,9 +19,8 @@ pub enum Cutout<'a> {
 /// Reads a picture that was cut before, as those of data sets are: its centre square (see [`crate::srn::load_square`]). Where the mask is
 /// black, pixels do not count.
 pub fn of_view(path: &Path, mask: Option<&Path>, intrinsics: &Intrinsics, side: usize) -> Result<Square> {
-    let (picture, opacity) = open_with_opacity(path)?;
-    let size = [picture.width, picture.height];
-    let mut photo = photo(path, picture, opacity)?;
+    let mut photo = photo(path)?;
+    let size = photo.size();
     if let Some(mask) = mask {
         photo.mask(counts(mask, size)?);
     }
@@ -38,9 +37,8 @@ pub fn of_photo(
     intrinsics: &Intrinsics,
     side: usize,
 ) -> Result<Square> {
-    let (picture, opacity) = open_with_opacity(path)?;
-    let size = [picture.width, picture.height];
-    let mut photo = photo(path, picture, opacity)?;
+    let mut photo = photo(path)?;
+    let size = photo.size();
     match cutout {
         None => {}
         Some(Cutout::Mask(mask)) => photo.cut_out(&counts(mask, size)?),
@@ -57,7 +55,9 @@ pub fn of_photo(
     })
 }
 
-fn photo(path: &Path, picture: Pixels, opacity: Vec<f32>) -> Result<Photo> {
+/// Reads a photograph.
+pub fn photo(path: &Path) -> Result<Photo> {
+    let (picture, opacity) = open_with_opacity(path)?;
     let found = format!("{}×{}", picture.width, picture.height);
     Photo::new(picture, opacity).ok_or_else(|| Error::field(path, "size", "pixels", found))
 }

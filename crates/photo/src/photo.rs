@@ -58,6 +58,11 @@ impl Photo {
         [self.pixels.width, self.pixels.height]
     }
 
+    /// Its colours, over white.
+    pub fn pixels(&self) -> &Pixels {
+        &self.pixels
+    }
+
     /// Leaves so much of each pixel, 0 to 1 `[height · width]`, and nothing of those that are missing there; the rest becomes white background, as what is transparent is.
     pub fn cut_out(&mut self, object: &[f32]) {
         let object = object.iter().chain(std::iter::repeat(&0.0));

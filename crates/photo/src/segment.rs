@@ -89,6 +89,20 @@ pub(crate) fn object_in(picture: &Pixels, bounds: BoundingBox, known: Known) -> 
 }
 
 impl BoundingBox {
+    /// With room on each side, so large a share of the longer side.
+    pub fn with_room(&self, share: f64) -> Self {
+        let room = share * self.size[0].max(self.size[1]);
+        BoundingBox { corner: self.corner.map(|first| first - room), size: self.size.map(|size| size + 2.0 * room) }
+    }
+
+    /// The part of what it covers, or another does, that both cover.
+    pub fn overlap(&self, other: &Self) -> f64 {
+        let end = |of: &Self, k: usize| of.corner[k] + of.size[k];
+        let both = [0, 1].map(|k| (end(self, k).min(end(other, k)) - self.corner[k].max(other.corner[k])).max(0.0));
+        let [both, own, others] = [both, self.size, other.size].map(|[width, height]| width * height);
+        both / (own + others - both)
+    }
+
     /// Whether a place is in it, or so near.
     fn is_within(&self, at: [f64; 2], slack: f64) -> bool {
         (0..2).all(|k| (self.corner[k] - slack..=self.corner[k] + self.size[k] + slack).contains(&at[k]))

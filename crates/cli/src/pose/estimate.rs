@@ -8,12 +8,13 @@ use clap::Args;
 use glam::DMat4;
 use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::photo::{BoundingBox, Boxed, Known, Outcome, Shot};
+use sigma_srn::photo::{Anywhere, Boxed, Known, Outcome, Shot, sightings};
 use sigma_srn::{Confidence, Doubt, Engine, Error, Found, Light, Model, Pose6, Progress, Search};
 use srn_data::camera::Axes;
+use srn_data::target::photo;
 
 use super::files::{
-    ObjectArgs, Picture, PoseSource, bounding_box, lines_on_stdin, model_side, path_of, srn_instance, warn_of_turned,
+    Bounds, ObjectArgs, Picture, PoseSource, bounds, lines_on_stdin, model_side, path_of, srn_instance, warn_of_turned,
 };
 use super::given::Given;
 use super::mask::MadeRight;
@@ -52,9 +53,10 @@ pub struct Estimate {
     #[arg(long, value_name = "FILE|DIR")]
     cutout: Vec<PathBuf>,
     /// A box around the object, as detectors give it, instead of a segmentation: left edge, top edge, width and height in pixels of the picture. What in it is the
-    /// object is found by its colours, and then by the pose that was found with these, from where the search is done once more. Once, or once per picture.
-    #[arg(long = "box", value_name = "X,Y,W,H", value_parser = bounding_box, allow_hyphen_values = true, conflicts_with_all = ["cutout", "unseen"])]
-    boxes: Vec<BoundingBox>,
+    /// object is found by its colours, and then by the pose that was found with these, from where the search is done once more. `auto`: it is looked for in all of the
+    /// picture, by how the model shows it from all around, and a pose is searched for at up to five places, until one is to be trusted. Once, or once per picture.
+    #[arg(long = "box", value_name = "X,Y,W,H|auto", value_parser = bounds, allow_hyphen_values = true, conflicts_with_all = ["cutout", "unseen"])]
+    boxes: Vec<Bounds>,
     /// What counts in a picture: white, or opaque. What is black (something before the object) has no part in the search: the object may go on there.
     /// Like --cutout.
     #[arg(long, value_name = "FILE|DIR")]
@@ -288,6 +290,14 @@ impl Looking<'_> {
             let pictures: Vec<_> = asked.iter().map(|asked| asked.picture.clone()).collect();
             return pass(&pictures, &starts.collect::<Result<Vec<_>>>()?);
         }
+        let is_anywhere = |asked: &Asked| asked.given.bounds == Some(Bounds::Anywhere);
+        if asked.len() > 1 && asked.iter().any(is_anywhere) {
+            let each = asked.iter().map(|asked| Ok(self.find(on, std::slice::from_ref(asked), pass)?.remove(0)));
+            return each.collect();
+        }
+        if asked.iter().any(is_anywhere) {
+            return Ok(vec![self.anywhere(on, &asked[0], pass)?]);
+        }
         let open = |i: usize, known: Known| Ok(self.args.open(&asked[i].given, on.model, on.side, known)?.shot);
         let starts = |i: usize, shot: &Shot| self.starts_of(shot, &asked[i].given);
         let boxed = Boxed { engine: on.engine, model: on.model, open: &open, starts: &starts };
@@ -297,6 +307,27 @@ impl Looking<'_> {
             let named = |(&i, shot): (&usize, _)| Picture { shot, ..asked[i].picture.clone() };
             pass(&numbers.iter().zip(shots).map(named).collect::<Vec<_>>(), starts)
         })
+    }
+
+    /// Searches for the object in a picture where it seems to be.
+    fn anywhere(&self, on: On, Asked { given, picture, .. }: &Asked, pass: Pass) -> Result<Outcome<Noted>> {
+        let photo = photo(&given.image)?;
+        let sightings = sightings(on.engine, on.model, picture.shot.instance, &photo)?;
+        let open = |bounds, known: Known| {
+            let given = Given { bounds: Some(Bounds::Box(bounds)), ..given.clone() };
+            Ok(self.args.open(&given, on.model, on.side, known)?.shot)
+        };
+        let mut named = |_: &[usize], shots: Vec<Shot>, starts: &[_]| {
+            pass(&shots.into_iter().map(|shot| Picture { shot, ..picture.clone() }).collect::<Vec<_>>(), starts)
+        };
+        let starts = |shot: &Shot| self.starts_of(shot, given);
+        let anywhere = Anywhere { engine: on.engine, model: on.model, open: &open, starts: &starts };
+        let found = anywhere.search(&sightings, &mut named)?;
+        // Where nothing differs from anything, it is the picture as it is.
+        match found {
+            Some(found) => Ok(found),
+            None => Ok(named(&[0], vec![picture.shot.clone()], &[starts(&picture.shot)?])?.remove(0)),
+        }
     }
 
     /// The settings of a search; those of pictures with boxes follow one another as they do.
@@ -328,7 +359,8 @@ fn searched(looking: &Looking, all: &[Asked], mut saved: Option<SavedViews>, out
     let is_boxed = !args.boxes.is_empty();
     let settings = looking.settings(is_boxed)?;
     let bar = progress::bar(0, "steps");
-    let (mut left, mut before) = (all.len().div_ceil(AT_ONCE) as u64 * if is_boxed { 2 } else { 1 }, 0);
+    let portions = if args.boxes.contains(&Bounds::Anywhere) { all.len() } else { all.len().div_ceil(AT_ONCE) };
+    let (mut left, mut before) = (portions as u64 * if is_boxed { 2 } else { 1 }, 0);
     let mut pass = |pictures: &[Picture], starts: &[Vec<DMat4>]| {
         let outcomes = pass(&settings, on, pictures, starts, |log, mut progress| {
             bar.set_length(before + left * u64::from(progress.steps));
@@ -338,7 +370,7 @@ fn searched(looking: &Looking, all: &[Asked], mut saved: Option<SavedViews>, out
             bar.set_position(before + u64::from(progress.step));
             if args.record.is_some() { log.note(&mut progress) } else { Ok(()) }
         })?;
-        // Pictures with boxes may need two more than was thought.
+        // Pictures with boxes may need more than was thought.
         (left, before) = ((left - 1).max(1), bar.position());
         bar.set_message("");
         Ok(outcomes)

@@ -75,13 +75,27 @@ impl CameraArgs {
     }
 }
 
+/// Where in a picture the object is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Bounds {
+    /// In this box.
+    Box(BoundingBox),
+    /// It is looked for.
+    Anywhere,
+}
+
 /// The value of --box.
-pub fn bounding_box(text: &str) -> std::result::Result<BoundingBox, String> {
+pub fn bounds(text: &str) -> std::result::Result<Bounds, String> {
+    if text == "auto" {
+        return Ok(Bounds::Anywhere);
+    }
     let numbers: Vec<f64> =
         text.split(',').filter_map(|number| number.trim().parse().ok()).filter(|n: &f64| n.is_finite()).collect();
     match (&numbers[..], text.matches(',').count()) {
-        (&[x, y, width, height], 3) if width > 0.0 && height > 0.0 => Ok(BoundingBox { corner: [x, y], size: [width, height] }),
-        _ => Err("expected left edge, top edge, width and height in pixels: `120,80,200,160`".into()),
+        (&[x, y, width, height], 3) if width > 0.0 && height > 0.0 => {
+            Ok(Bounds::Box(BoundingBox { corner: [x, y], size: [width, height] }))
+        }
+        _ => Err("expected `auto`, or left edge, top edge, width and height in pixels: `120,80,200,160`".into()),
     }
 }
 

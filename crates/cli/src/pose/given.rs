@@ -9,7 +9,7 @@ use sigma_srn::photo::{BoundingBox, Known};
 use srn_data::srn::rigid;
 use srn_data::target::Cutout;
 
-use super::files::{CameraArgs, Masks, Picture, path_of};
+use super::files::{Bounds, CameraArgs, Masks, Picture, path_of};
 use super::notation::Notation;
 use crate::common::Result;
 
@@ -22,8 +22,8 @@ pub struct Given {
     pub instance: Option<String>,
     /// What of it is the object: a file, or a folder with one that is called like the picture.
     pub cutout: Option<PathBuf>,
-    /// A box around the object instead.
-    pub bounds: Option<BoundingBox>,
+    /// A box around the object instead, or that there is none.
+    pub bounds: Option<Bounds>,
     /// What counts; like `cutout`.
     pub mask: Option<PathBuf>,
     /// Roughly known pose, and the true one, `world_from_camera`.
@@ -39,10 +39,24 @@ struct Line {
     instance: Option<String>,
     cutout: Option<PathBuf>,
     #[serde(rename = "box")]
-    bounds: Option<[f64; 4]>,
+    bounds: Option<BoxLine>,
     mask: Option<PathBuf>,
     /// Rows.
     rough: Option<[[f64; 4]; 4]>,
+}
+
+/// A box in such a line: four numbers, or `auto`.
+#[derive(Deserialize)]
+#[serde(untagged, expecting = "box: expected four numbers, or \"auto\"")]
+enum BoxLine {
+    Box([f64; 4]),
+    Word(Auto),
+}
+
+#[derive(Deserialize)]
+enum Auto {
+    #[serde(rename = "auto")]
+    Auto,
 }
 
 impl Given {
@@ -55,18 +69,23 @@ impl Given {
         if bounds.is_some() && cutout.is_some() {
             return Err("of `box` and `cutout` a picture has one".into());
         }
-        let bounds = bounds.map(|[x, y, width, height]| BoundingBox { corner: [x, y], size: [width, height] });
-        if let Some(BoundingBox { size, .. }) = bounds.filter(|bounds| bounds.size.iter().any(|&size| size <= 0.0)) {
-            return Err(format!("box: expected a width and a height above 0, found {}, {}", size[0], size[1]).into());
-        }
+        let bounds = match bounds {
+            Some(BoxLine::Box([_, _, width, height])) if width <= 0.0 || height <= 0.0 => {
+                return Err(format!("box: expected a width and a height above 0, found {width}, {height}").into());
+            }
+            Some(BoxLine::Box([x, y, width, height])) => Some(Bounds::Box(BoundingBox { corner: [x, y], size: [width, height] })),
+            Some(BoxLine::Word(Auto::Auto)) => Some(Bounds::Anywhere),
+            None => None,
+        };
         let pose = |rows: [[f64; 4]; 4]| rigid(Path::new("stdin"), "rough", DMat4::from_cols_array_2d(&rows).transpose());
         let rough = rough.map(pose).transpose()?.map(|pose| notation.ours(pose));
         Ok(Given { image, instance, cutout, bounds, mask, rough, truth: None })
     }
 
-    /// Opens the picture; if it has a box, with what is `known` of the object in it. `instance`: the object where it names none.
+    /// Opens the picture; if it has a box, with what is `known` of the object in it; whole, where nobody knows where in it the object is. `instance`: the object where it names none.
     pub fn open(&self, model: &Model, side: u32, instance: Option<&str>, camera: &CameraArgs, known: Known) -> Result<Picture> {
-        let cutout = self.cutout.as_deref().map(Cutout::Mask).or(self.bounds.map(|bounds| Cutout::Box(bounds, known)));
+        let bounds = self.bounds.and_then(|bounds| if let Bounds::Box(bounds) = bounds { Some(bounds) } else { None });
+        let cutout = self.cutout.as_deref().map(Cutout::Mask).or(bounds.map(|bounds| Cutout::Box(bounds, known)));
         let masks = Masks { cutout, mask: self.mask.as_deref() };
         let picture = Picture::open(&self.image, masks, model, side, self.instance.as_deref().or(instance), camera)?;
         Ok(Picture { truth: self.truth, ..picture })
@@ -85,13 +104,15 @@ mod tests {
         let line = format!(r#"{{"image": "a.png", "instance": "seat", "box": [1, 2.5, 3, 4], "mask": "m", "rough": {rough}}}"#);
         let given = parse(&line).unwrap();
         assert_eq!((given.instance.as_deref(), given.mask), (Some("seat"), Some("m".into())));
-        assert_eq!(given.bounds, Some(BoundingBox { corner: [1.0, 2.5], size: [3.0, 4.0] }));
+        assert_eq!(given.bounds, Some(Bounds::Box(BoundingBox { corner: [1.0, 2.5], size: [3.0, 4.0] })));
+        assert_eq!(parse(r#"{"image": "a.png", "box": "auto"}"#).unwrap().bounds, Some(Bounds::Anywhere));
         assert_eq!(given.rough.unwrap().w_axis.truncate().to_array(), [1.0, 2.0, 3.0]);
         assert_eq!(given.rough.unwrap().x_axis.truncate().to_array(), [0.0, 1.0, 0.0]);
         for (line, said) in [
             (r#"{"image": "a.png", "bbox": [1, 2, 3, 4]}"#, "bbox"),
             (r#"{"box": [1, 2, 3, 4]}"#, "image"),
-            (r#"{"image": "a.png", "box": [1, 2, 3]}"#, "4"),
+            (r#"{"image": "a.png", "box": [1, 2, 3]}"#, "four"),
+            (r#"{"image": "a.png", "box": "there"}"#, "auto"),
             (r#"{"image": "a.png", "box": [1, 2, 3, 0]}"#, "above 0"),
             (r#"{"image": "a.png", "box": [1, 2, 3, 4], "cutout": "c.png"}"#, "`cutout`"),
             (r#"{"image": "a.png", "rough": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#, "rough"),

@@ -4,17 +4,18 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
+use glam::DMat4;
 use image::RgbImage;
 use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::photo::{BoundingBox, Follower, Known, Looking, Shot};
-use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Tracked, Tracker};
+use sigma_srn::photo::{Anywhere, BoundingBox, Follower, FoundObject, Known, Looking, Open, Outcome, Shot, sightings};
+use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Search, Tracked, Tracker};
 use srn_data::pixels::{ENDINGS, is_picture};
-use srn_data::target::Cutout;
+use srn_data::target::{Cutout, photo};
 
 use super::draw;
 use super::files::{
-    Animation, Masks, ObjectArgs, Picture, PoseSource, bounding_box, lines_on_stdin, model_side, path_of, warn_of_turned,
+    Animation, Bounds, Masks, ObjectArgs, Picture, PoseSource, bounds, lines_on_stdin, model_side, path_of, warn_of_turned,
 };
 use super::mask::MadeRight;
 use super::notation::{NotationArgs, ObjectPose};
@@ -45,9 +46,9 @@ pub struct Track {
     #[arg(long, value_name = "DIR")]
     cutout: Option<PathBuf>,
     /// A box around the object in the first frame, as a detector gives it; see `estimate`. Frames need not be cut out then: what in each of them is the object is found
-    /// by its colours, and by where the poses before lead one to expect it.
-    #[arg(long = "box", value_name = "X,Y,W,H", value_parser = bounding_box, allow_hyphen_values = true, conflicts_with = "cutout")]
-    bounds: Option<BoundingBox>,
+    /// by its colours, and by where the poses before lead one to expect it. `auto`: it is looked for in all of the first frame.
+    #[arg(long = "box", value_name = "X,Y,W,H|auto", value_parser = bounds, allow_hyphen_values = true, conflicts_with = "cutout")]
+    bounds: Option<Bounds>,
     /// Folder with masks called like the frames, of what counts; see `estimate`.
     #[arg(long, value_name = "DIR")]
     mask: Option<PathBuf>,
@@ -125,10 +126,19 @@ pub fn run(args: &Track) -> Result<bool> {
         let masks = Masks { cutout, mask: args.mask.as_deref() };
         Picture::open(path, masks, &model, side, args.object.instance.as_deref(), &args.object.camera)
     };
+    let open_whole = |path: &Path| open(path, None);
     let search = args.search.single(args.search.options()?);
     let mut animation = None;
     let (mut tracker, mut followed) = (None::<Tracker>, None);
-    let mut follower = args.bounds.map(Follower::new);
+    let place = args.bounds.map(|bounds| match bounds {
+        Bounds::Box(bounds) => Ok(bounds),
+        Bounds::Anywhere => {
+            let starts = |shot: &Shot| args.search.starts(&args.search.all_around(), &model, shot, None, &notation);
+            let open = |bounds, known: Known| Ok(open(&first, Some(Cutout::Box(bounds, known)))?.shot);
+            looked_for(on, &search, &first, open_whole(&first)?.shot.instance, &open, &starts)
+        }
+    });
+    let mut follower = place.transpose()?.map(Follower::new);
     let (mut errors, mut searches, mut trusted, mut count) = (Vec::new(), 0, true, 0);
     for path in std::iter::once(Ok(first)).chain(frames) {
         let path = path?;
@@ -247,6 +257,31 @@ pub fn run(args: &Track) -> Result<bool> {
         );
     }
     Ok(trusted)
+}
+
+/// A box around the object in a frame in which nobody knows where it is.
+fn looked_for(
+    on: On,
+    search: &Search,
+    frame: &Path,
+    instance: u32,
+    open: Open<Box<dyn std::error::Error + Send + Sync>>,
+    starts: &dyn Fn(&Shot) -> Result<Vec<DMat4>>,
+) -> Result<BoundingBox> {
+    let On { engine, model, .. } = on;
+    let bar = progress::bar(0, "steps");
+    let mut observe = |seen: Progress| {
+        bar.set_length(seen.steps.into());
+        bar.set_position(seen.step.into());
+        Ok(())
+    };
+    let mut pass = |_: &[usize], shots: Vec<Shot>, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut observe)?);
+    let found = Anywhere { engine, model, open, starts }.search(&sightings(engine, model, instance, &photo(frame)?)?, &mut pass);
+    bar.finish_and_clear();
+    let nothing = || format!("{}: nothing in it looks like {}", frame.display(), model.instance_name(instance));
+    let Outcome { shot, found, .. } = found?.ok_or_else(nothing)?;
+    let object = FoundObject::of(&shot, &found.world_from_camera, engine, model, 1)?;
+    Ok(object.bounds().ok_or_else(nothing)?)
 }
 
 /// Paths of frames, as they come.

@@ -3,7 +3,8 @@
 use glam::DMat4;
 use srn_photo::Known;
 
-use super::{FoundObject, Shot};
+use super::follow::cut_out;
+use super::{FoundObject, Open, Shot, Sighting};
 use crate::camera::{fixed24, neighbor4};
 use crate::renderer::render_views;
 use crate::{Engine, Error, Found, Intrinsics, Model, View};
@@ -12,6 +13,9 @@ use crate::{Engine, Error, Found, Intrinsics, Model, View};
 const SIDE: u32 = 32;
 /// Where all channels are at least this (of [-1, 1]) a view shows background, or its edge.
 const WHITE: f32 = 0.9;
+
+/// Room around what seems to be the object, as a share of the longer side of its box: what sticks out of it may be missing there.
+const ROOM: f64 = 0.15;
 
 /// What came of a search.
 pub struct Outcome<L> {
@@ -98,5 +102,43 @@ impl<E: From<Error>> Boxed<'_, E> {
         let renders = render_views(self.engine, self.model, [SIDE; 2], &views)?;
         let pixels = renders.iter().flat_map(|render| render.rgb.chunks_exact(3)).map(|c| [c[0], c[1], c[2]]);
         Ok(pixels.filter(|colour| colour.iter().any(|&c| c < WHITE)).collect())
+    }
+}
+
+/// How a photograph is looked at in which nobody knows where the object is; see [`Boxed`].
+pub struct Anywhere<'a, E> {
+    /// What renders views.
+    pub engine: &'a Engine,
+    /// The model that knows the object.
+    pub model: &'a Model,
+    /// The photograph, cut out by a box and what is known of the object in it.
+    pub open: Open<'a, E>,
+    /// Where searches start.
+    pub starts: &'a dyn Fn(&Shot) -> Result<Vec<DMat4>, E>,
+}
+
+impl<E: From<Error>> Anywhere<'_, E> {
+    /// Searches at each of the places where the object seems to be, the likeliest first, until a pose is to be trusted; else what leaves the least unexplained counts. `None` where no
+    /// place differs from what is around it.
+    pub fn search<L>(self, sightings: &[Sighting], pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
+        let Anywhere { engine, model, open, starts } = self;
+        let (mut best, mut seconds) = (None::<Outcome<L>>, 0.0);
+        for Sighting { object, bounds, .. } in sightings {
+            let bounds = bounds.with_room(ROOM);
+            let boxed = Boxed { engine, model, open: &|_, known| open(bounds, known), starts: &|_, shot| starts(shot) };
+            let Ok(shot) = cut_out(bounds, object, open) else { continue };
+            let Some(outcome) = boxed.search(&[0], vec![shot], &mut *pass)?.pop() else { continue };
+            let Outcome { found, .. } = &outcome;
+            let is_trusted = found.is_trusted();
+            seconds += found.seconds;
+            if is_trusted || best.as_ref().is_none_or(|best| found.unexplained < best.found.unexplained) {
+                best = Some(outcome);
+            }
+            if is_trusted {
+                break;
+            }
+        }
+        best.iter_mut().for_each(|best| best.found.seconds = seconds);
+        Ok(best)
     }
 }

@@ -148,6 +148,7 @@ impl Follower {
     }
 }
 
-fn cut_out<E>(bounds: BoundingBox, object: &FoundObject, open: Open<E>) -> Result<Shot, E> {
+/// What an object covers, in a box.
+pub(super) fn cut_out<E>(bounds: BoundingBox, object: &FoundObject, open: Open<E>) -> Result<Shot, E> {
     open(bounds, Known { colours: &[], place: Some(&|at| object.shows(at)) })
 }

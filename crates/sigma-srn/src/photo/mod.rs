@@ -4,10 +4,13 @@
 mod boxed;
 mod follow;
 mod shown;
+mod sightings;
+mod template;
 
-pub use boxed::{Boxed, Outcome, Pass, StartsOf};
+pub use boxed::{Anywhere, Boxed, Outcome, Pass, StartsOf};
 pub use follow::{Follower, Looking, Observe, Open};
 pub use shown::FoundObject;
+pub use sightings::{Sighting, sightings};
 pub use srn_photo::{BoundingBox, Guess, Known, MARGIN, Photo, Pixels, Square};
 
 use glam::{DMat4, DQuat, DVec3};
@@ -141,24 +144,42 @@ impl Search {
         starts: impl Fn(&Shot) -> Result<Vec<DMat4>, Error>,
         mut observe: impl FnMut(Progress) -> Result<(), Error>,
     ) -> Result<(Shot, Found), Error> {
-        let side = model.metadata.side.unwrap_or(SIDE);
-        let open = |_, known: Known| {
-            Shot::in_box(photo, bounds, known, instance, side).ok_or_else(|| Error::Input {
-                input: format!("box {:?}, {:?}", bounds.corner, bounds.size),
-                what: "nothing in it differs from what is around it, or nothing is around it".into(),
-            })
-        };
-        let (first, _) = self.tries()?;
-        let single = Search { tries: vec![first.clone()], ..self.clone() };
-        let boxed = Boxed { engine, model, open: &open, starts: &|_, shot| starts(shot) };
-        let first = vec![open(0, Known::default())?];
+        let open = |known: Known| in_box(model, instance, photo, bounds, known);
+        let single = self.single()?;
+        let boxed = Boxed { engine, model, open: &|_, known| open(known), starts: &|_, shot| starts(shot) };
+        let first = vec![open(Known::default())?];
         let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
         let Outcome { shot, found, .. } = boxed.search(&[0], first, &mut pass)?.remove(0);
         Ok((shot, found))
     }
 
-    /// Searches for objects as they stand.
-    fn shots(
+    /// The same where nothing is known of where in the photograph the object is: where it seems to be ([`sightings`], [`Anywhere`]).
+    pub fn run_anywhere(
+        &self,
+        engine: &Engine,
+        model: &Model,
+        instance: u32,
+        photo: (&Photo, &Intrinsics),
+        starts: impl Fn(&Shot) -> Result<Vec<DMat4>, Error>,
+        mut observe: impl FnMut(Progress) -> Result<(), Error>,
+    ) -> Result<(Shot, Found), Error> {
+        let single = self.single()?;
+        let open = |bounds, known: Known| in_box(model, instance, photo, bounds, known);
+        let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
+        let anywhere = Anywhere { engine, model, open: &open, starts: &starts };
+        let found = anywhere.search(&sightings(engine, model, instance, photo.0)?, &mut pass)?;
+        let nothing = || Error::Input { input: "photograph".into(), what: "nothing in it differs from what is around it".into() };
+        found.map(|Outcome { shot, found, .. }| (shot, found)).ok_or_else(nothing)
+    }
+
+    /// Its first try alone.
+    fn single(&self) -> Result<Search, Error> {
+        let (first, _) = self.tries()?;
+        Ok(Search { tries: vec![first.clone()], ..self.clone() })
+    }
+
+    /// Searches for objects as they stand, each from its own starts.
+    pub fn shots(
         &self,
         engine: &Engine,
         model: &Model,
@@ -170,6 +191,15 @@ impl Search {
         let found = self.run(engine, model, &queries, observe)?;
         Ok(shots.into_iter().zip(found).map(|(shot, found)| Outcome { shot, found, log: () }).collect())
     }
+}
+
+/// The object in a box in a photograph, as the model takes it.
+fn in_box(model: &Model, instance: u32, photo: (&Photo, &Intrinsics), bounds: BoundingBox, known: Known) -> Result<Shot, Error> {
+    let side = model.metadata.side.unwrap_or(SIDE);
+    Shot::in_box(photo, bounds, known, instance, side).ok_or_else(|| Error::Input {
+        input: format!("box {:?}, {:?}", bounds.corner, bounds.size),
+        what: "nothing in it differs from what is around it, or nothing is around it".into(),
+    })
 }
 
 #[cfg(test)]

@@ -31,6 +31,13 @@ impl FoundObject {
         Ok(FoundObject { silhouette: Silhouette::of(&view.rgb, view_side as usize), square: shot.square })
     }
 
+    /// By a view of `side` pixels that shows this square of the picture, in pixels.
+    pub(super) fn in_square(rgb: &[f32], side: usize, corner: [f64; 2], size: f64) -> Self {
+        let extent = (size / WIDER as f64).round().max(1.0);
+        let corner = corner.map(|at| (at + 0.5 * (size - extent)).round() as i64);
+        FoundObject { silhouette: Silhouette::of(rgb, side), square: (corner, extent as usize) }
+    }
+
     /// A box around it, in pixels; `None` where the view shows nothing.
     pub fn bounds(&self) -> Option<BoundingBox> {
         let (corner, extent) = self.square;
@@ -72,7 +79,7 @@ impl FoundObject {
 }
 
 /// Where a view shows the object.
-struct Silhouette {
+pub(super) struct Silhouette {
     side: usize,
     /// How far from white each pixel is.
     darkness: Vec<f32>,
@@ -83,7 +90,7 @@ struct Silhouette {
 }
 
 impl Silhouette {
-    fn of(rgb: &[f32], side: usize) -> Self {
+    pub(super) fn of(rgb: &[f32], side: usize) -> Self {
         let far = |pixel: &[f32]| pixel.iter().map(|c| 1.0 - c.clamp(-1.0, 1.0)).fold(0.0, f32::max);
         let darkness: Vec<f32> = rgb.chunks_exact(3).map(far).collect();
         let mut object: Vec<f32> = darkness.iter().copied().filter(|&d| d > 0.2).collect();
@@ -123,6 +130,11 @@ impl Silhouette {
         };
         let ends = cells.fold(None, around)?;
         Some(ends.map(|end| end.map(|cells| cells as f64 / self.side as f64)))
+    }
+
+    /// Whether a pixel shows the object, and not white within it.
+    pub(super) fn is_object(&self, pixel: usize) -> bool {
+        self.darkness[pixel] > self.limit && !self.enclosed[pixel]
     }
 
     fn is_enclosed(&self, at: [f64; 2]) -> bool {

@@ -1,0 +1,404 @@
+//! Where in a photograph an object may be, of which nothing is known but how the model shows it: template matching over places, sizes, sides and rolls. What is looked for is
+//! a thing whose colours are rare in the picture and are the object's, cell by cell, up to how bright it is lit, and are not those around it.
+
+use std::f32::consts::TAU;
+use std::iter::zip;
+
+use glam::{DMat4, Vec3, Vec4, Vec4Swizzles};
+use rayon::prelude::*;
+use srn_photo::{Photo, Pixels};
+use srn_shaders::LinearParams;
+
+use super::template::{Cell, ROLL, ROLLS, SIDE, Template, WIDER, coarse, rolled_view};
+use super::{BoundingBox, FoundObject};
+use crate::camera::around2016;
+use crate::renderer::render_views;
+use crate::{Engine, Error, Intrinsics, Model, View};
+
+/// The longer side of what is looked at has at most so many pixels.
+const FINEST: f64 = 640.0;
+/// The smallest and the largest diagonals that are looked for, in these pixels, and in shorter sides of the picture; and by which factor they grow.
+const SMALLEST: f64 = 60.0;
+const LARGEST: f64 = 1.2;
+const STEP: f64 = 1.19;
+
+/// Deviation of a colour of the object from the model's, of [0, 1].
+const NOISE: f32 = 0.08;
+/// The logarithm of the density of the model's colour itself.
+fn sharpness() -> f32 {
+    -1.5 * (TAU * NOISE * NOISE).ln()
+}
+/// How many times as bright an object may be lit.
+const LIT: [f32; 2] = [0.7, 1.4];
+/// Logarithms of odds of a colour are no larger, those of the object's cells no less than the second, and what says that its surroundings differ is no more than that.
+const SUREST: f32 = 5.0;
+const MOST: f32 = 4.0;
+/// Logarithm of the odds beyond the picture's edge.
+const OUTSIDE: f32 = -2.0;
+/// A larger thing is less likely to look like the object by chance: the power of its size that counts.
+const SIZE: f32 = 0.3;
+
+/// How many are left after each look: of each size, of all, of these at places nearby, and in the end.
+const OF_SIZE: usize = 900;
+const BEST: usize = 500;
+const BETTER: usize = 200;
+const FINE: usize = 200;
+const LIKELIEST: usize = 5;
+/// Templates at a place that go on.
+const AT_PLACE: usize = 3;
+/// Two that have more than this part of both boxes in common are one.
+const SAME: f64 = 0.4;
+
+/// Where in a photograph the object may be.
+pub struct Sighting {
+    /// What it would cover.
+    pub object: FoundObject,
+    /// A box around that.
+    pub bounds: BoundingBox,
+    /// A camera that would see the side that is seen.
+    pub world_from_camera: DMat4,
+}
+
+/// Where a template fits.
+#[derive(Clone, Copy)]
+struct Match {
+    /// Of the view, in pixels of the picture that is looked at.
+    middle: [f32; 2],
+    /// The object's diagonal there.
+    diagonal: f32,
+    /// The view's number times [`ROLLS`], and its roll among these, and in radians.
+    template: usize,
+    roll: f32,
+    /// How much speaks for it.
+    evidence: f32,
+}
+
+/// Where in a photograph the object may be, the likeliest place first. It is found where its diagonal is an eleventh or more of the photograph's longer side.
+pub fn sightings(engine: &Engine, model: &Model, instance: u32, photo: &Photo) -> Result<Vec<Sighting>, Error> {
+    let radius = model.metadata.orbit_radius.unwrap_or(1.3);
+    let (focal, middle) = (SIDE as f64 * radius / WIDER, 0.5 * SIDE as f64);
+    let camera = Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.5 };
+    let cameras = around2016(radius);
+    let views: Vec<View> = cameras.iter().step_by(ROLLS).map(|pose| (instance, *pose, camera)).collect();
+    let views = render_views(engine, model, [SIDE as u32; 2], &views)?;
+    let views: Vec<Vec<f32>> = views.into_iter().map(|view| view.rgb).collect();
+    let size = photo.size().map(|pixels| pixels as f64);
+    let finer = (FINEST / size[0].max(size[1])).min(1.0);
+    let [width, height] = size.map(|pixels| (finer * pixels).round().max(1.0) as usize);
+    let found = Looked::at(photo.pixels().area_resample(width, height)).matches(&views);
+    let mut sightings: Vec<Sighting> = Vec::new();
+    for Match { middle, diagonal, template, roll, .. } in found {
+        let wide = WIDER * f64::from(diagonal) / finer;
+        let corner = middle.map(|at| f64::from(at) / finer - 0.5 * wide);
+        let view = rolled_view(&views[template / ROLLS], roll);
+        let object = FoundObject::in_square(&view, SIDE, corner, wide);
+        let Some(bounds) = object.bounds() else { continue };
+        if sightings.iter().all(|other| bounds.overlap(&other.bounds) < SAME) {
+            sightings.push(Sighting { object, bounds, world_from_camera: cameras[template] });
+        }
+        if sightings.len() == LIKELIEST {
+            break;
+        }
+    }
+    Ok(sightings)
+}
+
+/// A picture as it is looked at.
+struct Looked {
+    /// Each half as fine as the one before; the colours of a pixel in [0, 1], and how surprising they are.
+    levels: Vec<Level>,
+}
+
+struct Level {
+    width: usize,
+    height: usize,
+    pixels: Vec<Vec4>,
+}
+
+impl Looked {
+    fn at(picture: Pixels) -> Self {
+        let Pixels { width, height, data } = picture;
+        let colours: Vec<Vec3> = data.chunks_exact(3).map(|c| 0.5 * Vec3::from_slice(c) + 0.5).collect();
+        let pixels = zip(&colours, surprises(&colours)).map(|(colour, surprise)| colour.extend(surprise)).collect();
+        let mut levels = vec![Level { width, height, pixels }];
+        while let Some(last) = levels.last().filter(|last| last.width.min(last.height) >= 16) {
+            levels.push(last.resampled(last.width / 2, last.height / 2));
+        }
+        Looked { levels }
+    }
+
+    /// The most likely ones, the likeliest first.
+    fn matches(&self, views: &[Vec<f32>]) -> Vec<Match> {
+        let views: Vec<Template> = views.iter().map(|rgb| Template::of(rgb)).collect();
+        let templates = coarse(&views);
+        let matrices = Matrices::of(&templates);
+        let [width, height] = [self.levels[0].width, self.levels[0].height].map(|side| side as f64);
+        let largest = LARGEST * width.min(height);
+        let sizes = std::iter::successors(Some(SMALLEST), |size| Some(size * STEP)).take_while(|size| *size <= largest);
+        let first: Vec<Match> = sizes.flat_map(|size| matrices.everywhere(&self.levels[0], size)).collect();
+        let half = |found: &Match| &templates[found.template][1];
+        let first = best(first.into_par_iter().map(|found| self.judged(found, half(&found))).collect(), BEST);
+        let by = |found: Match, template: &Template, step: f32| {
+            let tried = found.nearby(step).map(|found| self.judged(found, template));
+            tried.max_by(|a, b| a.evidence.total_cmp(&b.evidence)).unwrap_or(found)
+        };
+        let better = first.into_par_iter().map(|found| by(found, half(&found), 0.06)).collect();
+        let finer = |found: Vec<Match>, step: f32, turn: f32| {
+            let turned = |found: Match, turn: f32| {
+                let found = Match { roll: found.roll + turn, ..found };
+                by(found, &views[found.template / ROLLS].rolled(found.roll), step)
+            };
+            let of = |found: Match| [turned(found, -turn), turned(found, turn)].into_iter().fold(turned(found, 0.0), Match::or);
+            found.into_par_iter().map(of).collect()
+        };
+        let finest = finer(best(better, BETTER), 0.03, ROLL / 3.0);
+        best(finer(best(finest, FINE), 0.015, ROLL / 6.0), FINE)
+    }
+
+    /// With what speaks for it, by this template.
+    fn judged(&self, sighting: Match, template: &Template) -> Match {
+        let wide = WIDER as f32 * sighting.diagonal;
+        let cell = wide / template.side as f32;
+        let level = (cell / 1.4).log2().round().clamp(0.0, (self.levels.len() - 1) as f32) as usize;
+        let (level, fine) = (&self.levels[level], 0.5f32.powi(level as i32));
+        let place = |i: usize, k: usize| {
+            let at = [i % template.side, i / template.side][k] as f32;
+            fine * (sighting.middle[k] + (at + 0.5) * cell - 0.5 * wide)
+        };
+        let seen = |(i, Cell { own, around }): (usize, &Cell)| {
+            let is_needed = own.w > 0.0 || around.w > 0.0;
+            is_needed.then(|| level.at([place(i, 0), place(i, 1)])).flatten()
+        };
+        let seen: Vec<Option<Vec4>> = template.cells.iter().enumerate().map(seen).collect();
+        let cells = || zip(&seen, &template.cells);
+        let own = cells().filter_map(|(seen, Cell { own, .. })| Some((seen.as_ref()?, own)));
+        let (both, square) = own.filter(|(_, own)| own.w > 0.0).fold((0.0, 0.0), |(both, square), (seen, own)| {
+            (both + seen.xyz().dot(own.xyz()), square + own.xyz().length_squared() / own.w)
+        });
+        let lit = lit(both, square);
+        let off = |seen: &Vec4, cell: &Vec4| (seen.xyz() - lit * cell.xyz() / cell.w).length_squared() / (2.0 * NOISE * NOISE);
+        let (mut of_own, mut of_around) = (Mean::default(), Mean { weight: 1.0, ..Mean::default() });
+        for (seen, Cell { own, around }) in cells() {
+            if own.w > 0.0 {
+                of_own.add(own.w, seen.map_or(OUTSIDE, |seen| (seen.w - off(&seen, own)).max(-MOST)));
+            }
+            if let Some(seen) = seen.filter(|_| around.w > 0.0) {
+                of_around.add(around.w, off(&seen, around).min(MOST));
+            }
+        }
+        let evidence = (of_own.mean() + of_around.mean()) * (sighting.diagonal / SMALLEST as f32).powf(SIZE);
+        Match { evidence, ..sighting }
+    }
+}
+
+/// How bright the object is lit, by least squares.
+fn lit(both: f32, square: f32) -> f32 {
+    (both / square.max(1e-6)).clamp(LIT[0], LIT[1])
+}
+
+#[derive(Default)]
+struct Mean {
+    sum: f32,
+    weight: f32,
+}
+
+impl Mean {
+    fn add(&mut self, weight: f32, value: f32) {
+        (self.sum, self.weight) = (self.sum + weight * value, self.weight + weight);
+    }
+
+    fn mean(&self) -> f32 {
+        self.sum / self.weight.max(1e-6)
+    }
+}
+
+impl Match {
+    /// As it is, moved by a part of the diagonal, and so much larger and smaller.
+    fn nearby(self, step: f32) -> impl Iterator<Item = Self> {
+        let offs = move |k: usize| [k % 3, k / 3 % 3, k / 9].map(|k| (k as f32 - 1.0) * step);
+        (0..27).map(offs).map(move |[x, y, larger]| {
+            let diagonal = self.diagonal * (1.0 + 1.4 * larger);
+            Match { middle: [self.middle[0] + x * diagonal, self.middle[1] + y * diagonal], diagonal, ..self }
+        })
+    }
+
+    /// The one for which more speaks.
+    fn or(self, other: Self) -> Self {
+        if other.evidence > self.evidence { other } else { self }
+    }
+}
+
+/// Those for which the most speaks, in that order.
+fn best(mut sightings: Vec<Match>, most: usize) -> Vec<Match> {
+    sightings.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
+    sightings.truncate(most);
+    sightings
+}
+
+/// How surprising each colour is: by how much the model's colours are denser where they are than the picture's own. Logarithms.
+fn surprises(colours: &[Vec3]) -> Vec<f32> {
+    const BINS: usize = 16;
+    /// Density that every colour has, where it is 1 in the mean.
+    const ANY: f32 = 0.05;
+    let bin = |colour: &Vec3| colour.to_array().map(|c| ((c * BINS as f32) as usize).min(BINS - 1));
+    let number = |[r, g, b]: [usize; 3]| (r * BINS + g) * BINS + b;
+    let mut counts = vec![0.0f32; BINS.pow(3)];
+    colours.iter().for_each(|colour| counts[number(bin(colour))] += 1.0);
+    for step in [1, BINS, BINS * BINS] {
+        let smooth = |i: usize| {
+            let at = i / step % BINS;
+            let (before, after) = (if at > 0 { i - step } else { i }, if at + 1 < BINS { i + step } else { i });
+            0.25 * counts[before] + 0.5 * counts[i] + 0.25 * counts[after]
+        };
+        counts = (0..counts.len()).map(smooth).collect();
+    }
+    let dense = BINS.pow(3) as f32 / colours.len() as f32;
+    let surprise = |colour: &Vec3| (sharpness() - (dense * counts[number(bin(colour))] + ANY).ln()).clamp(-SUREST, SUREST);
+    colours.iter().map(surprise).collect()
+}
+
+impl Level {
+    /// By the means of areas.
+    fn resampled(&self, width: usize, height: usize) -> Level {
+        let channels = |of: fn(&Vec4) -> Vec3| {
+            let data = self.pixels.iter().flat_map(|pixel| of(pixel).to_array()).collect();
+            Pixels { width: self.width, height: self.height, data }.area_resample(width, height).data
+        };
+        let (colours, surprises) = (channels(|pixel| pixel.xyz()), channels(|pixel| Vec3::splat(pixel.w)));
+        let pixel = |(colour, surprise): (&[f32], &[f32])| Vec3::from_slice(colour).extend(surprise[0]);
+        let pixels = zip(colours.chunks_exact(3), surprises.chunks_exact(3)).map(pixel).collect();
+        Level { width, height, pixels }
+    }
+
+    /// What is at a place, in pixels from the edge, between pixels; `None` beyond the edge.
+    fn at(&self, place: [f32; 2]) -> Option<Vec4> {
+        let ends = [self.width, self.height];
+        if (0..2).any(|k| !(0.0..ends[k] as f32).contains(&place[k])) {
+            return None;
+        }
+        let at = [0, 1].map(|k| (place[k] - 0.5).clamp(0.0, (ends[k] - 1) as f32));
+        let ([x, y], [right, below]) = (at.map(|at| at as usize), at.map(f32::fract));
+        let pixel = |x: usize, y: usize| self.pixels[y.min(self.height - 1) * self.width + x.min(self.width - 1)];
+        let row = |y: usize| pixel(x, y).lerp(pixel(x + 1, y), right);
+        Some(row(y).lerp(row(y + 1), below))
+    }
+
+    /// With so many pixels more on each side: colours as they are at the edge, which speak against an object.
+    fn padded(&self, by: usize) -> Level {
+        let [width, height] = [self.width, self.height].map(|side| side + 2 * by);
+        let pixel = |i: usize| {
+            let at = [i % width, i / width];
+            let [x, y] = [0, 1].map(|k| at[k].saturating_sub(by).min([self.width, self.height][k] - 1));
+            let is_inside = [x + by, y + by] == at;
+            let pixel = self.pixels[y * self.width + x];
+            if is_inside { pixel } else { pixel.xyz().extend(OUTSIDE) }
+        };
+        Level { width, height, pixels: (0..width * height).map(pixel).collect() }
+    }
+}
+
+/// All templates in the fewest cells, as matrices: `[templates, cells]` and `[templates, cells · 3]`, each with as many zeros, for it is the weights of a linear layer.
+struct Matrices {
+    side: usize,
+    count: usize,
+    own: Vec<f32>,
+    own_colours: Vec<f32>,
+    around: Vec<f32>,
+    around_colours: Vec<f32>,
+    /// Of each template: how many cells are its own, and the sum of the squares of their colours; the same of what is around it.
+    sums: Vec<[[f32; 2]; 2]>,
+}
+
+impl Matrices {
+    fn of(templates: &[[Template; 2]]) -> Self {
+        let count = templates.len();
+        let matrix = |of: &dyn Fn(&Cell) -> Vec<f32>| -> Vec<f32> {
+            let rows: Vec<f32> = templates.iter().flat_map(|[coarse, _]| coarse.cells.iter().flat_map(of)).collect();
+            rows.into_iter().chain(std::iter::repeat_n(0.0, count)).collect()
+        };
+        let sums = |[coarse, _]: &[Template; 2]| {
+            let sum = |part: fn(&Cell) -> Vec4| {
+                let cells = coarse.cells.iter().map(part).filter(|part| part.w > 0.0);
+                cells.fold([0.0; 2], |[share, square], part| [share + part.w, square + part.xyz().length_squared() / part.w])
+            };
+            [sum(|cell| cell.own), sum(|cell| cell.around)]
+        };
+        Matrices {
+            side: templates[0][0].side,
+            count,
+            own: matrix(&|cell| vec![cell.own.w]),
+            own_colours: matrix(&|cell| cell.own.xyz().to_array().into()),
+            around: matrix(&|cell| vec![cell.around.w]),
+            around_colours: matrix(&|cell| cell.around.xyz().to_array().into()),
+            sums: templates.iter().map(sums).collect(),
+        }
+    }
+
+    /// The best sightings of one size, with the view's middle on a grid of cells.
+    fn everywhere(&self, picture: &Level, diagonal: f64) -> Vec<Match> {
+        let (side, cell) = (self.side, WIDER * diagonal / self.side as f64);
+        let cells = [picture.width, picture.height].map(|pixels| (pixels as f64 / cell).round() as usize);
+        if cells[0].min(cells[1]) < side / 2 {
+            return vec![];
+        }
+        let padding = side / 4;
+        let padded = picture.resampled(cells[0], cells[1]).padded(padding);
+        let [columns, rows] = [padded.width, padded.height].map(|cells| cells + 1 - side);
+        let row = |y: usize| {
+            let found = self.row(&padded, y, columns);
+            found.map(move |(x, template, evidence)| {
+                let middle = |at: usize, pixels: usize, cells: usize| {
+                    (at as f32 + 0.5 * side as f32 - padding as f32) * pixels as f32 / cells as f32
+                };
+                let middle = [middle(x, picture.width, cells[0]), middle(y, picture.height, cells[1])];
+                Match { middle, diagonal: diagonal as f32, template, roll: (template % ROLLS) as f32 * ROLL, evidence }
+            })
+        };
+        best((0..rows).into_par_iter().flat_map_iter(row).collect(), OF_SIZE)
+    }
+
+    /// Of each place in a row the templates for which the most speaks, by number, and how much.
+    fn row(&self, picture: &Level, y: usize, columns: usize) -> impl Iterator<Item = (usize, usize, f32)> + use<> {
+        let side = self.side;
+        let patch = |x: usize| (0..side * side).map(move |i| picture.pixels[(y + i / side) * picture.width + x + i % side]);
+        let all = || (0..columns).flat_map(patch);
+        let twice = 2.0 * NOISE * NOISE;
+        let square = |pixel: &Vec4| pixel.xyz().length_squared() / twice;
+        let colours: Vec<f32> = all().flat_map(|pixel| pixel.xyz().to_array()).collect();
+        let odds: Vec<f32> = all().map(|pixel| pixel.w - square(&pixel)).collect();
+        let squares: Vec<f32> = all().map(|pixel| square(&pixel)).collect();
+        let product = |x: &[f32], weights: &[f32]| {
+            let mut y = vec![0.0f32; columns * self.count];
+            let p = LinearParams {
+                groups: 1,
+                rows_per_group: columns as u32,
+                in_features: (x.len() / columns) as u32,
+                out_features: self.count as u32,
+                ..LinearParams::default()
+            };
+            srn_cpu::ops::linear::forward(p, x, weights, &[], &mut y);
+            y
+        };
+        let own = zip(product(&odds, &self.own), product(&colours, &self.own_colours));
+        let around = zip(product(&squares, &self.around), product(&colours, &self.around_colours));
+        let sums = self.sums.iter().cycle();
+        let evidence = zip(zip(own, around), sums).map(|(((odds, both), (square, other)), [own, around])| {
+            let lit = lit(both, own[1]);
+            let of_own = (odds + (2.0 * lit * both - lit * lit * own[1]) / twice) / own[0].max(1e-3);
+            let of_around = (square + (lit * lit * around[1] - 2.0 * lit * other) / twice) / around[0].max(1e-3);
+            of_own + of_around.clamp(0.0, MOST)
+        });
+        let evidence: Vec<f32> = evidence.collect();
+        let at_place = |(x, evidence): (usize, &[f32])| {
+            let mut best = [(0, f32::NEG_INFINITY); AT_PLACE];
+            for (template, &evidence) in evidence.iter().enumerate() {
+                if evidence > best[AT_PLACE - 1].1 {
+                    best[AT_PLACE - 1] = (template, evidence);
+                    best.sort_by(|a, b| b.1.total_cmp(&a.1));
+                }
+            }
+            best.map(|(template, evidence)| (x, template, evidence))
+        };
+        evidence.chunks_exact(self.count).enumerate().flat_map(at_place).collect::<Vec<_>>().into_iter()
+    }
+}
