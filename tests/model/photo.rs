@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use sigma_srn::photo::{BoundingBox, FoundObject, Photo, Shot};
+use sigma_srn::photo::{BoundingBox, FoundObject, Photo, Shot, sightings};
 use sigma_srn::{Effort, Engine, Error, Found, Intrinsics, Model, Search, camera};
 
 /// Of the pictures in `assets/scenes`.
@@ -42,6 +42,26 @@ fn an_object_is_found_in_a_box() {
     }
     // Its forks do not fill the box, nor does it cover what lies outside.
     assert!(object.covers([150.0, 150.0]) && !object.covers([50.0, 80.0]) && !object.covers([150.0, 20.0]));
+}
+
+/// As in its box, where nobody says where it is.
+#[test]
+fn an_object_is_found_anywhere() {
+    let truth = srn_data::srn::read_pose(Path::new("../assets/scenes/forklift.txt")).unwrap();
+    let model = Model::load(Path::new("../assets/models/compact.safetensors")).unwrap();
+    let (engine, search, instance) = (Engine::cpu(), Search::of(Effort::Fast), model.instance("forklift").unwrap());
+    let first = &sightings(&engine, &model, instance, &scene()).unwrap()[0];
+    assert!(first.bounds.overlap(&FORKLIFT) > 0.5, "{:?}", first.bounds);
+    let starts = |shot: &Shot| shot.around(&model, camera::around2016, None);
+    let (_, found) = search.run_anywhere(&engine, &model, instance, (&scene(), &INTRINSICS), starts, |_| Ok(())).unwrap();
+    let (angle, distance) = camera::pose_error(&found.world_from_camera, &truth);
+    assert!(angle < 0.6 && distance < 0.015 && found.is_trusted(), "{angle} {distance} {:?}", found.doubt);
+    let grey = Photo::from_rgba8(64, 48, &[120, 130, 140, 255].repeat(64 * 48)).unwrap();
+    let nothing = search.run_anywhere(&engine, &model, instance, (&grey, &INTRINSICS), starts, |_| Ok(()));
+    let said = nothing.map(|(_, found)| found.is_trusted());
+    assert!(
+        said.as_ref().is_ok_and(|is_trusted| !is_trusted) || said.is_err_and(|error| error.to_string().contains("nothing in it"))
+    );
 }
 
 #[test]

@@ -351,6 +351,8 @@ fn pictures_and_what_is_said_of_them_come_on_stdin() {
     };
     let found = ask(&format!(r#"{{"image": "photo.png", "instance": "seat", "box": [{bounds}]}}"#));
     assert!(found["trusted"] == true && found["instance"] == "seat" && found["image"] == "photo.png", "{found}");
+    let looked_for = ask(r#"{"image": "photo.png", "instance": "seat", "box": "auto"}"#);
+    assert!(looked_for["trusted"] == true, "{looked_for}");
     let rough = &found["world_from_camera"];
     let again = ask(&format!(r#"{{"image": "photo.png", "instance": "seat", "box": [{bounds}], "rough": {rough}}}"#));
     let at = |found: &Value, k: usize| found["world_from_camera"][k][3].as_f64().unwrap();
@@ -942,6 +944,14 @@ fn a_box_around_the_object_is_enough() {
     let lines: Vec<&str> = text.lines().collect();
     assert!(lines.len() == 3 && lines[0].starts_with("table.png  DO NOT TRUST: ") && lines[1].starts_with("photo.png  seat"));
     fail(dir, &format!("estimate table.png table.png {given} {args}"), &["table.png", "box"]);
+
+    // Nor need anyone say where it is; where it is not, that is told.
+    let looked_for = format!("estimate photo.png table.png {args} --box auto --intrinsics camera.txt --record anywhere");
+    let all = json(&run(dir, &looked_for, 1))["images"].take();
+    let off = all[0]["error"]["rotation_deg"].as_f64().unwrap();
+    assert!(off < 1.5 && all[0]["trusted"] == true && all[1]["trusted"] == false, "{all}");
+    assert!(files(&dir.join("anywhere")).contains(&"seat-photo-outline.png".into()));
+    fail(dir, &format!("estimate photo.png {args} --box there --intrinsics camera.txt"), &["--box", "auto"]);
 }
 
 /// The seat goes to the right; once something is before the whole camera, once before the seat, and once longer.
@@ -971,6 +981,9 @@ fn a_box_in_the_first_frame_is_enough() {
     assert_eq!(each(&frames, "searched")[..5], [Some(true), Some(false), None, Some(false), Some(false)]);
     assert!(frames[2]["failure"].as_str().unwrap().contains("box"), "{}", frames[2]);
     assert_eq!(frames_of(&dir.join("track.gif")), 5);
+    // So is none.
+    let looked_for = lines(&run(dir, &format!("track frames/0.png frames/1.png --box auto {args}"), 0));
+    assert_eq!(each(&looked_for, "trusted"), [Some(true); 2], "{looked_for:?}");
     // Where a search with a box finds it in the last of them, too.
     let alone = json(&run(dir, &format!("estimate frames/4.png --box {} {args}", boxes[4]), 0))["images"][0].take();
     let position = |found: &Value| {

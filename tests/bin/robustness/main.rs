@@ -3,6 +3,7 @@
 
 mod capture;
 mod photo;
+mod scene;
 mod sides;
 mod video;
 
@@ -11,19 +12,20 @@ use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode, Output};
 
+use glam::DMat4;
 use image::imageops::{self, FilterType};
 use image::{Rgb, RgbImage, Rgba};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde_json::Value;
-use srn_data::sheet;
+use srn_data::{sheet, srn};
 
 use crate::photo::{Lit, OUTSIDE, Photo, SIDE, Spoil, Spoiled, exposed};
 use crate::video::Video;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [others] [sides] [video] [captures] [--seed N] [--starts STARTS]";
+const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [rooms] [others] [sides] [video] [captures] [--seed N] [--starts STARTS]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -48,6 +50,9 @@ const COLUMNS: usize = 6;
 /// Focal length of most, and of those from so near that they are 90° across.
 const FOCAL: f64 = 297.6;
 const WIDE: f64 = 128.0;
+const FOCAL_OF_ROOM: f64 = 600.0;
+/// Other things in a room.
+const IN_ROOM: usize = 9;
 
 const STOP_LESS: Lit = |colour, _| exposed(colour, [0.5; 3]);
 const STOP_MORE: Lit = |colour, _| exposed(colour, [2.0; 3]);
@@ -81,6 +86,10 @@ const fn from(what: &'static str, distance: f64, focal: f64) -> Row {
     Row { distance, focal, ..row(what, Spoil::Nothing) }
 }
 
+const fn in_room(what: &'static str, distance: f64, spoil: Spoil) -> Row {
+    Row { what, distance, focal: FOCAL_OF_ROOM, spoil, is_rolled: distance > 4.0 }
+}
+
 const fn rolled(what: &'static str, spoil: Spoil) -> Row {
     Row { is_rolled: true, ..row(what, spoil) }
 }
@@ -91,7 +100,7 @@ struct Table {
     rows: &'static [Row],
 }
 
-const TABLES: [Table; 9] = [
+const TABLES: [Table; 10] = [
     Table {
         name: "distance",
         searches: &[AROUND_FAST],
@@ -164,6 +173,15 @@ const TABLES: [Table; 9] = [
             row("on a table", Spoil::Among(0, 0)),
             row("seven others behind it", Spoil::Among(7, 0)),
             row("the next object", Spoil::Among(7, 1)),
+        ],
+    },
+    Table {
+        name: "rooms",
+        searches: &[AROUND, AROUND_FAST],
+        rows: &[
+            in_room("from 3", 3.0, Spoil::Room(0)),
+            in_room("from 4.5, rolled", 4.5, Spoil::Room(0)),
+            in_room("the next object", 3.0, Spoil::Room(1)),
         ],
     },
     Table {
@@ -301,7 +319,8 @@ fn captures(programs: &Programs, seed: u64) -> Result<()> {
 struct Picture {
     picture: PathBuf,
     mask: Option<PathBuf>,
-    bounds: Option<[u32; 4]>,
+    /// As `--box` has it.
+    bounds: Option<String>,
     intrinsics: PathBuf,
     truth: PathBuf,
 }
@@ -367,7 +386,11 @@ impl Programs {
 
     /// What the search finds of an object's pictures.
     fn estimated(&self, row: &Row, how: How, object: usize, pictures: &[Picture]) -> Result<Vec<Found>> {
-        let claimed = if let Spoil::Another(further) | Spoil::Among(_, further) = row.spoil { object + further } else { object };
+        let claimed = if let Spoil::Another(further) | Spoil::Among(_, further) | Spoil::Room(further) = row.spoil {
+            object + further
+        } else {
+            object
+        };
         let mut found = Vec::new();
         for picture in pictures {
             let mut estimate = self.command("sigma-pose");
@@ -381,8 +404,8 @@ impl Programs {
             if let Some(mask) = &picture.mask {
                 estimate.arg("--mask").arg(mask);
             }
-            if let Some([x, y, width, height]) = picture.bounds {
-                estimate.arg(format!("--box={x},{y},{width},{height}"));
+            if let Some(bounds) = &picture.bounds {
+                estimate.arg(format!("--box={bounds}"));
             }
             let output = estimate.output()?;
             let report: Value = serde_json::from_slice(&output.stdout).map_err(|_| said(&output))?;
@@ -448,16 +471,24 @@ fn spoiled(row: &Row, views: &Path, folder: &Path, seed: u64) -> Result<Vec<Pict
     let rendered = |name: &str, view: usize| image::open(of(name, view, "rgb").with_extension("png")).map(|view| view.to_rgb8());
     for (object, (name, _)) in OBJECTS.into_iter().enumerate() {
         for view in 0..VIEWS {
-            let photo = Photo::new(&rendered(name, view)?, &mut random);
-            let others = if let Spoil::Among(count, _) = row.spoil { count } else { 0 };
+            let others = match row.spoil {
+                Spoil::Among(count, _) => count,
+                Spoil::Room(_) => IN_ROOM,
+                _ => 0,
+            };
             let mut behind = Vec::new();
             for _ in 0..others {
                 let (other, _) = OBJECTS[(object + random.random_range(1..OBJECTS.len())) % OBJECTS.len()];
                 behind.push(rendered(other, random.random_range(0..VIEWS))?);
             }
-            let Spoiled { picture, mask, bounds, corner } =
-                photo.among(&behind, &mut random).spoiled(row.spoil, view, &mut random);
             let path = |end: &str| folder.join(format!("{name}-{view}{end}"));
+            let truth = of(name, view, "pose").with_extension("txt");
+            if let Spoil::Room(_) = row.spoil {
+                pictures.push(in_a_room(row, &rendered(name, view)?, &truth, &behind, &path, &mut random)?);
+                continue;
+            }
+            let Spoiled { picture, mask, bounds, corner } =
+                Photo::new(&rendered(name, view)?, &mut random).among(&behind, &mut random).spoiled(row.spoil, view, &mut random);
             picture.save(path(".png"))?;
             let mask = mask.map(|mask| mask.save(path("-mask.png")).map(|()| path("-mask.png"))).transpose()?;
             let [x, y] = corner.map(|pixels| f64::from(SIDE) / 2.0 - f64::from(pixels));
@@ -466,11 +497,29 @@ fn spoiled(row: &Row, views: &Path, folder: &Path, seed: u64) -> Result<Vec<Pict
             pictures.push(Picture {
                 picture: path(".png"),
                 mask,
-                bounds,
+                bounds: bounds.map(|[x, y, width, height]| format!("{x},{y},{width},{height}")),
                 intrinsics: path(".txt"),
-                truth: of(name, view, "pose").with_extension("txt"),
+                truth,
             });
         }
     }
     Ok(pictures)
+}
+
+/// Writes an object in a room, whose `pose` is of a camera that has it in the middle.
+fn in_a_room(
+    row: &Row,
+    object: &RgbImage,
+    pose: &Path,
+    others: &[RgbImage],
+    path: &dyn Fn(&str) -> PathBuf,
+    random: &mut Pcg64Mcg,
+) -> Result<Picture> {
+    let (picture, turn) = scene::room(object, others, random)?;
+    let [width, height] = scene::SIZE;
+    picture.save(path(".png"))?;
+    std::fs::write(path(".txt"), format!("{} {} {} 0.\n0. 0. 0.\n1.\n{height} {width}\n", row.focal, width / 2, height / 2))?;
+    let rows = (srn::read_pose(pose)? * DMat4::from_mat3(turn)).transpose().to_cols_array().map(|value| value.to_string());
+    std::fs::write(path(".pose"), rows.join(" "))?;
+    Ok(Picture { picture: path(".png"), mask: None, bounds: Some("auto".into()), intrinsics: path(".txt"), truth: path(".pose") })
 }

@@ -46,6 +46,8 @@ pub enum Spoil {
     Another(usize),
     /// Not cut out: on the table, so many others behind it, and a box around it; then given as another, so many further on.
     Among(usize, usize),
+    /// In a room with others, nobody knows where; given as another, so many further on.
+    Room(usize),
 }
 
 /// A picture of an object on a table.
@@ -102,7 +104,7 @@ impl Photo {
         let (mut seen, mut mask, mut frame) = (self.object.clone(), None, [[0, SIDE]; 2]);
         let mut bounds = None;
         match spoil {
-            Spoil::Nothing | Spoil::Another(_) => {}
+            Spoil::Nothing | Spoil::Another(_) | Spoil::Room(_) => {}
             Spoil::Light(lit) => self.lit_by(lit),
             Spoil::Larger(by) => seen = self.moved(|_, _| by),
             Spoil::Ragged(by) => {

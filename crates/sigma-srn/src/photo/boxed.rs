@@ -127,7 +127,7 @@ impl<E: From<Error>> Anywhere<'_, E> {
             let bounds = bounds.with_room(ROOM);
             let boxed = Boxed { engine, model, open: &|_, known| open(bounds, known), starts: &|_, shot| starts(shot) };
             let Ok(shot) = cut_out(bounds, object, open) else { continue };
-            let Some(outcome) = boxed.search(&[0], vec![shot], &mut *pass)?.pop() else { continue };
+            let Some(outcome) = boxed.in_turns(&[0], vec![shot], &mut *pass)?.pop() else { continue };
             let Outcome { found, .. } = &outcome;
             let is_trusted = found.is_trusted();
             seconds += found.seconds;

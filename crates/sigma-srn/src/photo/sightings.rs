@@ -17,8 +17,8 @@ use crate::{Engine, Error, Intrinsics, Model, View};
 
 /// The longer side of what is looked at has at most so many pixels.
 const FINEST: f64 = 640.0;
-/// The smallest and the largest diagonals that are looked for, in these pixels, and in shorter sides of the picture; and by which factor they grow.
-const SMALLEST: f64 = 60.0;
+/// The smallest and the largest diagonals that are looked for, in longer and in shorter sides of the picture; and by which factor they grow.
+const SMALLEST: f64 = 0.09375;
 const LARGEST: f64 = 1.2;
 const STEP: f64 = 1.19;
 
@@ -134,7 +134,8 @@ impl Looked {
         let matrices = Matrices::of(&templates);
         let [width, height] = [self.levels[0].width, self.levels[0].height].map(|side| side as f64);
         let largest = LARGEST * width.min(height);
-        let sizes = std::iter::successors(Some(SMALLEST), |size| Some(size * STEP)).take_while(|size| *size <= largest);
+        let sizes = std::iter::successors(Some(SMALLEST * width.max(height)), |size| Some(size * STEP))
+            .take_while(|size| *size <= largest);
         let first: Vec<Match> = sizes.flat_map(|size| matrices.everywhere(&self.levels[0], size)).collect();
         let half = |found: &Match| &templates[found.template][1];
         let first = best(first.into_par_iter().map(|found| self.judged(found, half(&found))).collect(), BEST);
@@ -186,7 +187,7 @@ impl Looked {
                 of_around.add(around.w, off(&seen, around).min(MOST));
             }
         }
-        let evidence = (of_own.mean() + of_around.mean()) * (sighting.diagonal / SMALLEST as f32).powf(SIZE);
+        let evidence = (of_own.mean() + of_around.mean()) * sighting.diagonal.powf(SIZE);
         Match { evidence, ..sighting }
     }
 }
@@ -400,5 +401,64 @@ impl Matrices {
             best.map(|(template, evidence)| (x, template, evidence))
         };
         evidence.chunks_exact(self.count).enumerate().flat_map(at_place).collect::<Vec<_>>().into_iter()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIDE_OF_PICTURE: [usize; 2] = [200, 150];
+
+    /// A half disc of two colours, of which the view shows [`WIDER`] times as much as it is wide.
+    fn object(at: [f64; 2]) -> Option<[f32; 3]> {
+        let is_object = at[0].hypot(at[1]) < 0.5 && at[1] > -0.1;
+        is_object.then_some(if at[0] < 0.0 { [0.7, -0.8, -0.6] } else { [-0.8, -0.6, 0.8] })
+    }
+
+    fn view(of: impl Fn([f64; 2]) -> Option<[f32; 3]>) -> Vec<f32> {
+        let at = |i: usize| [i % SIDE, i / SIDE].map(|k| ((k as f64 + 0.5) / SIDE as f64 - 0.5) * WIDER);
+        (0..SIDE * SIDE).flat_map(|i| of(at(i)).unwrap_or([1.0; 3])).collect()
+    }
+
+    /// Grey squares, and the object so wide, turned, and lit less; beside it a thing of one of its colours.
+    fn picture(middle: [f64; 2], diagonal: f64, turn: f64) -> Pixels {
+        let [width, height] = SIDE_OF_PICTURE;
+        let colour = |i: usize| {
+            let [x, y] = [i % width, i / width];
+            let off = [x as f64 + 0.5 - middle[0], y as f64 + 0.5 - middle[1]].map(|off| off / diagonal);
+            let (sin, cos) = turn.sin_cos();
+            let grey = if (x / 13 + y / 13).is_multiple_of(2) { -0.2 } else { 0.1 };
+            let noise = [0.04, -0.06, 0.02, 0.0, -0.03][(3 * x + 7 * y) % 5];
+            let darker = |colour: f32| 0.85 * (colour + 1.0) - 1.0;
+            let other = ((8..60).contains(&x) && (8..40).contains(&y)).then_some([0.7, -0.8, -0.6]);
+            let object = object([cos * off[0] - sin * off[1], sin * off[0] + cos * off[1]]).map(|colour| colour.map(darker));
+            object.or(other).unwrap_or([grey; 3]).map(|colour: f32| (colour + noise).clamp(-1.0, 1.0))
+        };
+        Pixels { width, height, data: (0..width * height).flat_map(colour).collect() }
+    }
+
+    #[test]
+    fn a_thing_is_found_where_it_is_as_large_and_turned_as_it_is() {
+        let of_one_colour = view(|at| object(at).map(|_| [0.7, -0.8, -0.6]));
+        let views = [of_one_colour, view(object)];
+        for (middle, diagonal, turn) in [([120.0, 90.0], 50.0, 0.4), ([70.0, 100.0], 80.0, 2.9), ([150.0, 60.0], 33.0, -1.5)] {
+            let found = Looked::at(picture(middle, diagonal, turn)).matches(&views)[0];
+            let off = (0..2).map(|k| (f64::from(found.middle[k]) - middle[k]).abs()).fold(0.0, f64::max);
+            let larger = f64::from(found.diagonal) / diagonal;
+            let turned = (f64::from(found.roll) - turn).rem_euclid(std::f64::consts::TAU);
+            let turned = turned.min(std::f64::consts::TAU - turned);
+            assert!(found.template / ROLLS == 1 && off < 0.06 * diagonal, "{middle:?}: {:?}", found.middle);
+            assert!((0.9..1.12).contains(&larger) && turned < 0.2, "{middle:?}: {larger} {turned}");
+        }
+    }
+
+    #[test]
+    fn pictures_of_any_size_and_of_one_colour_have_places_or_none() {
+        for [width, height] in [[1, 1], [3, 200], [40, 30]] {
+            let pixels = Pixels { width, height, data: vec![0.3; 3 * width * height] };
+            let found = Looked::at(pixels).matches(&[view(object), view(|_| None)]);
+            assert!(found.iter().all(|found| found.evidence.is_finite()), "{width} × {height}");
+        }
     }
 }
