@@ -177,7 +177,7 @@ const TABLES: [Table; 10] = [
     },
     Table {
         name: "rooms",
-        searches: &[AROUND, AROUND_FAST],
+        searches: &[AROUND_FAST],
         rows: &[
             in_room("from 3", 3.0, Spoil::Room(0)),
             in_room("from 4.5, rolled", 4.5, Spoil::Room(0)),

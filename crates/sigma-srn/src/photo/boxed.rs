@@ -16,6 +16,8 @@ const WHITE: f32 = 0.9;
 
 /// Room around what seems to be the object, as a share of the longer side of its box: what sticks out of it may be missing there.
 const ROOM: f64 = 0.15;
+/// At so many places where it seems to be the object is searched for once more, by its colours.
+const AGAIN: usize = 2;
 
 /// What came of a search.
 pub struct Outcome<L> {
@@ -49,7 +51,12 @@ impl<E: From<Error>> Boxed<'_, E> {
     /// Searches for objects in the photographs with these numbers, that were cut out by their boxes alone, then from where these end, cut out anew by the model's view from there. Where that is not to be
     /// trusted it begins once more with the colours of the model's object; what leaves less unexplained counts.
     pub fn search<L>(&self, numbers: &[usize], shots: Vec<Shot>, pass: Pass<L, E>) -> Result<Vec<Outcome<L>>, E> {
-        let mut outcomes = self.in_turns(numbers, shots, pass)?;
+        let outcomes = self.in_turns(numbers, shots, pass)?;
+        self.by_colours(numbers, outcomes, pass)
+    }
+
+    /// What is not to be trusted once more, by the colours of the model's object.
+    fn by_colours<L>(&self, numbers: &[usize], mut outcomes: Vec<Outcome<L>>, pass: Pass<L, E>) -> Result<Vec<Outcome<L>>, E> {
         let (mut lost, mut anew) = (Vec::new(), Vec::new());
         for (i, Outcome { shot, .. }) in outcomes.iter().enumerate().filter(|(_, outcome)| !outcome.found.is_trusted()) {
             let colours = self.colours(shot.instance)?;
@@ -118,23 +125,42 @@ pub struct Anywhere<'a, E> {
 }
 
 impl<E: From<Error>> Anywhere<'_, E> {
-    /// Searches at each of the places where the object seems to be, the likeliest first, until a pose is to be trusted; else what leaves the least unexplained counts. `None` where no
-    /// place differs from what is around it.
+    /// Searches at each of the places where the object seems to be, the likeliest first, until a pose is to be trusted; if none is, once more by the colours of the model's object where the least is
+    /// left unexplained, which counts. `None` where no place differs from what is around it.
     pub fn search<L>(self, sightings: &[Sighting], pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
         let Anywhere { engine, model, open, starts } = self;
-        let (mut best, mut seconds) = (None::<Outcome<L>>, 0.0);
+        let (mut outcomes, mut seconds) = (Vec::new(), 0.0);
         for Sighting { object, bounds, .. } in sightings {
             let bounds = bounds.with_room(ROOM);
-            let boxed = Boxed { engine, model, open: &|_, known| open(bounds, known), starts: &|_, shot| starts(shot) };
+            let open_it = |_, known: Known| open(bounds, known);
+            let boxed = Boxed { engine, model, open: &open_it, starts: &|_, shot| starts(shot) };
             let Ok(shot) = cut_out(bounds, object, open) else { continue };
-            let Some(outcome) = boxed.in_turns(&[0], vec![shot], &mut *pass)?.pop() else { continue };
-            let Outcome { found, .. } = &outcome;
-            let is_trusted = found.is_trusted();
-            seconds += found.seconds;
-            if is_trusted || best.as_ref().is_none_or(|best| found.unexplained < best.found.unexplained) {
-                best = Some(outcome);
+            for outcome in boxed.in_turns(&[0], vec![shot], &mut *pass)? {
+                seconds += outcome.found.seconds;
+                outcomes.push((bounds, outcome));
             }
-            if is_trusted {
+            if outcomes.last().is_some_and(|(_, outcome)| outcome.found.is_trusted()) {
+                break;
+            }
+        }
+        let order = |(_, a): &(_, Outcome<L>), (_, b): &(_, Outcome<L>)| {
+            let trusted = b.found.is_trusted().cmp(&a.found.is_trusted());
+            trusted.then(a.found.unexplained.total_cmp(&b.found.unexplained))
+        };
+        outcomes.sort_by(order);
+        let mut best = None::<Outcome<L>>;
+        for (bounds, outcome) in outcomes.into_iter().take(AGAIN) {
+            let before = outcome.found.seconds;
+            let open_it = |_, known: Known| open(bounds, known);
+            let boxed = Boxed { engine, model, open: &open_it, starts: &|_, shot| starts(shot) };
+            for outcome in boxed.by_colours(&[0], vec![outcome], &mut *pass)? {
+                let Outcome { found, .. } = &outcome;
+                seconds += found.seconds - before;
+                if found.is_trusted() || best.as_ref().is_none_or(|best| found.unexplained < best.found.unexplained) {
+                    best = Some(outcome);
+                }
+            }
+            if best.as_ref().is_some_and(|best| best.found.is_trusted()) {
                 break;
             }
         }
