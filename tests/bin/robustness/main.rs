@@ -477,9 +477,14 @@ fn spoiled(row: &Row, views: &Path, folder: &Path, seed: u64) -> Result<Vec<Pict
                 _ => 0,
             };
             let mut behind = Vec::new();
-            for _ in 0..others {
-                let (other, _) = OBJECTS[(object + random.random_range(1..OBJECTS.len())) % OBJECTS.len()];
-                behind.push(rendered(other, random.random_range(0..VIEWS))?);
+            while behind.len() < others {
+                let further = random.random_range(1..OBJECTS.len());
+                let (other, _) = OBJECTS[(object + further) % OBJECTS.len()];
+                let other = rendered(other, random.random_range(0..VIEWS))?;
+                // Anywhere in a room it would be the one that is looked for.
+                if !matches!(row.spoil, Spoil::Room(claimed) if claimed == further) {
+                    behind.push(other);
+                }
             }
             let path = |end: &str| folder.join(format!("{name}-{view}{end}"));
             let truth = of(name, view, "pose").with_extension("txt");
