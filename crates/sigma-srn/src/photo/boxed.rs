@@ -130,7 +130,7 @@ impl<E: From<Error>> Anywhere<'_, E> {
     pub fn search<L>(self, sightings: &[Sighting], pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
         let Anywhere { engine, model, open, starts } = self;
         let (mut outcomes, mut seconds) = (Vec::new(), 0.0);
-        for Sighting { object, bounds, .. } in sightings {
+        for Sighting { object, bounds } in sightings {
             let bounds = bounds.with_room(ROOM);
             let open_it = |_, known: Known| open(bounds, known);
             let boxed = Boxed { engine, model, open: &open_it, starts: &|_, shot| starts(shot) };

@@ -4,7 +4,7 @@
 use std::f32::consts::TAU;
 use std::iter::zip;
 
-use glam::{DMat4, Vec3, Vec4, Vec4Swizzles};
+use glam::{Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
 use srn_photo::{Photo, Pixels};
 use srn_shaders::LinearParams;
@@ -24,10 +24,6 @@ const STEP: f64 = 1.19;
 
 /// Deviation of a colour of the object from the model's, of [0, 1].
 const NOISE: f32 = 0.08;
-/// The logarithm of the density of the model's colour itself.
-fn sharpness() -> f32 {
-    -1.5 * (TAU * NOISE * NOISE).ln()
-}
 /// How many times as bright an object may be lit.
 const LIT: [f32; 2] = [0.7, 1.4];
 /// Logarithms of odds of a colour are no larger, those of the object's cells no less than the second, and what says that its surroundings differ is no more than that.
@@ -38,11 +34,10 @@ const OUTSIDE: f32 = -2.0;
 /// A larger thing is less likely to look like the object by chance: the power of its size that counts.
 const SIZE: f32 = 0.3;
 
-/// How many are left after each look: of each size, of all, of these at places nearby, and in the end.
+/// How many are left after each look: of each size, of all, of these moved a little, and in the end.
 const OF_SIZE: usize = 900;
 const BEST: usize = 500;
 const BETTER: usize = 200;
-const FINE: usize = 200;
 const LIKELIEST: usize = 5;
 /// Templates at a place that go on.
 const AT_PLACE: usize = 3;
@@ -55,8 +50,6 @@ pub struct Sighting {
     pub object: FoundObject,
     /// A box around that.
     pub bounds: BoundingBox,
-    /// A camera that would see the side that is seen.
-    pub world_from_camera: DMat4,
 }
 
 /// Where a template fits.
@@ -78,8 +71,8 @@ pub fn sightings(engine: &Engine, model: &Model, instance: u32, photo: &Photo) -
     let radius = model.metadata.orbit_radius.unwrap_or(1.3);
     let (focal, middle) = (SIDE as f64 * radius / WIDER, 0.5 * SIDE as f64);
     let camera = Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.5 };
-    let cameras = around2016(radius);
-    let views: Vec<View> = cameras.iter().step_by(ROLLS).map(|pose| (instance, *pose, camera)).collect();
+    let cameras = around2016(radius).into_iter().step_by(ROLLS);
+    let views: Vec<View> = cameras.map(|pose| (instance, pose, camera)).collect();
     let views = render_views(engine, model, [SIDE as u32; 2], &views)?;
     let views: Vec<Vec<f32>> = views.into_iter().map(|view| view.rgb).collect();
     let size = photo.size().map(|pixels| pixels as f64);
@@ -94,7 +87,7 @@ pub fn sightings(engine: &Engine, model: &Model, instance: u32, photo: &Photo) -
         let object = FoundObject::in_square(&view, SIDE, corner, wide);
         let Some(bounds) = object.bounds() else { continue };
         if sightings.iter().all(|other| bounds.overlap(&other.bounds) < SAME) {
-            sightings.push(Sighting { object, bounds, world_from_camera: cameras[template] });
+            sightings.push(Sighting { object, bounds });
         }
         if sightings.len() == LIKELIEST {
             break;
@@ -153,18 +146,18 @@ impl Looked {
             found.into_par_iter().map(of).collect()
         };
         let finest = finer(best(better, BETTER), 0.03, ROLL / 3.0);
-        best(finer(best(finest, FINE), 0.015, ROLL / 6.0), FINE)
+        best(finer(finest, 0.015, ROLL / 6.0), BETTER)
     }
 
     /// With what speaks for it, by this template.
-    fn judged(&self, sighting: Match, template: &Template) -> Match {
-        let wide = WIDER as f32 * sighting.diagonal;
+    fn judged(&self, found: Match, template: &Template) -> Match {
+        let wide = WIDER as f32 * found.diagonal;
         let cell = wide / template.side as f32;
         let level = (cell / 1.4).log2().round().clamp(0.0, (self.levels.len() - 1) as f32) as usize;
         let (level, fine) = (&self.levels[level], 0.5f32.powi(level as i32));
         let place = |i: usize, k: usize| {
             let at = [i % template.side, i / template.side][k] as f32;
-            fine * (sighting.middle[k] + (at + 0.5) * cell - 0.5 * wide)
+            fine * (found.middle[k] + (at + 0.5) * cell - 0.5 * wide)
         };
         let seen = |(i, Cell { own, around }): (usize, &Cell)| {
             let is_needed = own.w > 0.0 || around.w > 0.0;
@@ -187,8 +180,8 @@ impl Looked {
                 of_around.add(around.w, off(&seen, around).min(MOST));
             }
         }
-        let evidence = (of_own.mean() + of_around.mean()) * sighting.diagonal.powf(SIZE);
-        Match { evidence, ..sighting }
+        let evidence = (of_own.mean() + of_around.mean()) * found.diagonal.powf(SIZE);
+        Match { evidence, ..found }
     }
 }
 
@@ -234,6 +227,11 @@ fn best(mut sightings: Vec<Match>, most: usize) -> Vec<Match> {
     sightings.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
     sightings.truncate(most);
     sightings
+}
+
+/// The logarithm of the density of the model's colour itself.
+fn sharpness() -> f32 {
+    -1.5 * (TAU * NOISE * NOISE).ln()
 }
 
 /// How surprising each colour is: by how much the model's colours are denser where they are than the picture's own. Logarithms.
