@@ -126,7 +126,6 @@ pub fn run(args: &Track) -> Result<bool> {
         let masks = Masks { cutout, mask: args.mask.as_deref() };
         Picture::open(path, masks, &model, side, args.object.instance.as_deref(), &args.object.camera)
     };
-    let open_whole = |path: &Path| open(path, None);
     let search = args.search.single(args.search.options()?);
     let mut animation = None;
     let (mut tracker, mut followed) = (None::<Tracker>, None);
@@ -134,8 +133,8 @@ pub fn run(args: &Track) -> Result<bool> {
         Bounds::Box(bounds) => Ok(bounds),
         Bounds::Anywhere => {
             let starts = |shot: &Shot| args.search.starts(&args.search.all_around(), &model, shot, None, &notation);
-            let open = |bounds, known: Known| Ok(open(&first, Some(Cutout::Box(bounds, known)))?.shot);
-            looked_for(on, &search, &first, open_whole(&first)?.shot.instance, &open, &starts)
+            let boxed = |bounds, known: Known| Ok(open(&first, Some(Cutout::Box(bounds, known)))?.shot);
+            looked_for(on, &search, &first, open(&first, None)?.shot.instance, &boxed, &starts)
         }
     });
     let mut follower = place.transpose()?.map(Follower::new);
