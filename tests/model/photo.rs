@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use sigma_srn::photo::{BoundingBox, FoundObject, Photo, Shot, sightings};
+use sigma_srn::photo::{BoundingBox, FoundObject, Photo, Shot, Sightings};
 use sigma_srn::{Effort, Engine, Error, Found, Intrinsics, Model, Search, camera};
 
 /// Of the pictures in `assets/scenes`.
@@ -50,12 +50,26 @@ fn an_object_is_found_anywhere() {
     let truth = srn_data::srn::read_pose(Path::new("../assets/scenes/forklift.txt")).unwrap();
     let model = Model::load(Path::new("../assets/models/compact.safetensors")).unwrap();
     let (engine, search, instance) = (Engine::cpu(), Search::of(Effort::Fast), model.instance("forklift").unwrap());
-    let first = &sightings(&engine, &model, instance, &scene()).unwrap()[0];
+    let photo = scene();
+    let sightings = Sightings::of(&engine, &model, instance, &photo).unwrap();
+    let first = &sightings.likeliest(1)[0];
     assert!(first.bounds.overlap(&FORKLIFT) > 0.5, "{:?}", first.bounds);
     let starts = |shot: &Shot| shot.around(&model, camera::around2016, None);
-    let (_, found) = search.run_anywhere(&engine, &model, instance, (&scene(), &INTRINSICS), starts, |_| Ok(())).unwrap();
+    let (shot, found) = search.run_anywhere(&engine, &model, instance, (&photo, &INTRINSICS), starts, |_| Ok(())).unwrap();
     let (angle, distance) = camera::pose_error(&found.world_from_camera, &truth);
     assert!(angle < 0.6 && distance < 0.015 && found.is_trusted(), "{angle} {distance} {:?}", found.doubt);
+    // Less speaks for wrong poses, and something else for a better one: next to it, or all around the object from it.
+    let evidence = |pose: &glam::DMat4| sightings.evidence(&shot, pose).unwrap();
+    for degrees in [12.0f64, -70.0, 180.0] {
+        let wrong = glam::DMat4::from_rotation_z(degrees.to_radians()) * truth;
+        assert!(evidence(&wrong) < 0.97 * evidence(&truth), "{degrees}: {} of {}", evidence(&wrong), evidence(&truth));
+        let rival = sightings.rival(&shot, &wrong).unwrap().unwrap();
+        let [before, after] = [&wrong, &rival.side].map(|side| {
+            let facing = |pose| shot.facing(&model, pose).unwrap();
+            camera::pose_error(&facing(side), &facing(&truth)).0
+        });
+        assert!(after < before.min(40.0), "{degrees}: {before} {after}");
+    }
     let grey = Photo::from_rgba8(64, 48, &[120, 130, 140, 255].repeat(64 * 48)).unwrap();
     let nothing = search.run_anywhere(&engine, &model, instance, (&grey, &INTRINSICS), starts, |_| Ok(()));
     let said = nothing.map(|(_, found)| found.is_trusted());

@@ -6,7 +6,7 @@ use std::error::Error;
 use std::path::Path;
 
 use sigma_srn::camera::around2016;
-use sigma_srn::photo::{BoundingBox, Follower, Known, Looking, Photo, Shot};
+use sigma_srn::photo::{BoundingBox, Follower, Known, Looking, Photo, Shot, Sightings};
 use sigma_srn::{Effort, Engine, Intrinsics, Model, Search, Tracked, Tracker};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -35,12 +35,15 @@ fn main() -> Result<(), Box<dyn Error>> {
             Ok(Shot::in_box((&photo, &intrinsics), bounds, known, instance, side).ok_or("nothing in the box")?)
         };
         let starts = |shot: &Shot| -> Result<_, Box<dyn Error>> { Ok(shot.around(&model, around2016, None)?) };
-        let looking = Looking { engine: &engine, model: &model, search: &search, starts: &starts, open: &open };
-        let Ok(shot) = follower.open(&open) else {
+        let sightings = || Ok(Sightings::of(&engine, &model, instance, &photo)?);
+        let looking =
+            Looking { engine: &engine, model: &model, search: &search, starts: &starts, open: &open, sightings: &sightings };
+        let shot = follower.open(&open).ok();
+        let Some((_, tracked)) = follower.next(shot, &mut tracker, &looking, &mut |_| Ok(()))? else {
             println!("{frame}: nothing to be seen");
             continue;
         };
-        let (_, Tracked { found, is_searched }) = follower.next(shot, &mut tracker, &looking, &mut |_| Ok(()))?;
+        let Tracked { found, is_searched } = tracked;
         let how = if is_searched { "searched for" } else { "followed" };
         let verdict = found.doubt.map_or("trusted".into(), |doubt| format!("not to be trusted: {doubt}"));
         println!("{frame}: {how}, camera at {:.3}, {verdict}", found.world_from_camera.w_axis.truncate());

@@ -8,7 +8,7 @@ use clap::Args;
 use glam::DMat4;
 use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::photo::{Anywhere, Boxed, Known, Outcome, Shot, sightings};
+use sigma_srn::photo::{Anywhere, Boxed, Known, Outcome, Shot, Sightings};
 use sigma_srn::{Confidence, Doubt, Engine, Error, Found, Light, Model, Pose6, Progress, Search};
 use srn_data::camera::Axes;
 use srn_data::target::photo;
@@ -312,7 +312,7 @@ impl Looking<'_> {
     /// Searches for the object in a picture where it seems to be.
     fn anywhere(&self, on: On, Asked { given, picture, .. }: &Asked, pass: Pass) -> Result<Outcome<Noted>> {
         let photo = photo(&given.image)?;
-        let sightings = sightings(on.engine, on.model, picture.shot.instance, &photo)?;
+        let sightings = Sightings::of(on.engine, on.model, picture.shot.instance, &photo)?;
         let open = |bounds, known: Known| {
             let given = Given { bounds: Some(Bounds::Box(bounds)), ..given.clone() };
             Ok(self.args.open(&given, on.model, on.side, known)?.shot)

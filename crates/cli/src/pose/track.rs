@@ -8,7 +8,7 @@ use glam::DMat4;
 use image::RgbImage;
 use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::photo::{Anywhere, BoundingBox, Follower, FoundObject, Known, Looking, Open, Outcome, Shot, sightings};
+use sigma_srn::photo::{Anywhere, BoundingBox, Follower, FoundObject, Known, Looking, Open, Outcome, Shot, Sightings};
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Search, Tracked, Tracker};
 use srn_data::pixels::{ENDINGS, is_picture};
 use srn_data::target::{Cutout, photo};
@@ -154,22 +154,30 @@ pub fn run(args: &Track) -> Result<bool> {
             }
             _ => Ok(shot),
         });
+        let failed = |failure: &str| {
+            let frame = path.display().to_string();
+            print(&if args.json {
+                serde_json::json!({ "frame": frame, "trusted": false, "failure": failure }).to_string()
+            } else {
+                format!("{frame}  DO NOT TRUST: {failure}")
+            })
+        };
+        let mut failure = String::new();
         let shot = match shot {
-            Ok(shot) => shot,
+            Ok(shot) => Some(shot),
             // The first says whether the flags are right; later ones come from a camera that may have lost the object.
-            Err(failure) if tracker.is_some() => {
-                trusted = false;
-                count += 1;
-                let (frame, failure) = (path.display().to_string(), failure.to_string());
-                print(&if args.json {
-                    serde_json::json!({ "frame": frame, "trusted": trusted, "failure": failure }).to_string()
-                } else {
-                    format!("{frame}  DO NOT TRUST: {failure}")
-                })?;
-                continue;
+            Err(error) if tracker.is_some() => {
+                failure = error.to_string();
+                None
             }
             Err(error) => return Err(error),
         };
+        // It may be elsewhere in a frame, if there is one.
+        if shot.is_none() && (follower.is_none() || photo(&path).is_err()) {
+            (trusted, count) = (false, count + 1);
+            failed(&failure)?;
+            continue;
+        }
         let truth = match args.truth.as_ref().map(|truth| truth.read(&path, &notation)).transpose() {
             Err(error) if tracker.is_some() => {
                 eprintln!("warning: {error}");
@@ -177,7 +185,8 @@ pub fn run(args: &Track) -> Result<bool> {
             }
             truth => truth?,
         };
-        followed = Some(shot.instance);
+        followed = followed.or(shot.as_ref().map(|shot| shot.instance));
+        let Some(instance) = followed else { return Err(failure.into()) };
         let rough = args.rough.as_ref().filter(|_| tracker.is_none()).map(|rough| rough.read(&path, &notation)).transpose()?;
         let is_boxed = follower.is_some();
         let starts = |shot: &Shot| {
@@ -189,7 +198,7 @@ pub fn run(args: &Track) -> Result<bool> {
         };
         let tracker = match &mut tracker {
             Some(tracker) => tracker,
-            none => none.insert(Tracker::new(&engine, &model, shot.instance, search.clone(), rough)?),
+            none => none.insert(Tracker::new(&engine, &model, instance, search.clone(), rough)?),
         };
         count += 1;
         let mut observe = |seen: Progress| {
@@ -201,18 +210,25 @@ pub fn run(args: &Track) -> Result<bool> {
             }
             Ok(())
         };
-        let tracked = with_cooperative_said(&engine, || match &mut follower {
-            Some(follower) => {
-                let looking = Looking { engine: &engine, model: &model, search: &search, starts: &starts, open: &boxed };
+        let sightings = || Ok(Sightings::of(&engine, &model, instance, &photo(&path)?)?);
+        let tracked = with_cooperative_said(&engine, || match (&mut follower, shot) {
+            (Some(follower), shot) => {
+                let (search, starts, open, sightings) = (&search, &starts, &boxed, &sightings);
+                let looking = Looking { engine: &engine, model: &model, search, starts, open, sightings };
                 follower.next(shot, tracker, &looking, &mut observe)
             }
-            None => {
+            (None, Some(shot)) => {
                 let tracked = tracker.next(shot.query(starts(&shot)?), &mut observe)?;
-                Ok((shot, tracked))
+                Ok(Some((shot, tracked)))
             }
+            (None, None) => Ok(None),
         });
         bar.iter().for_each(ProgressBar::finish_and_clear);
-        let (shot, Tracked { found, is_searched: searched }) = tracked?;
+        let Some((shot, Tracked { found, is_searched: searched })) = tracked? else {
+            trusted = false;
+            failed(&failure)?;
+            continue;
+        };
         trusted = found.is_trusted();
         let mask = MadeRight::of(&found.estimate, shot.pixels_of_photo());
         let error = truth.map(|truth| notation.error(PoseError::of(&found.world_from_camera, &truth)));
@@ -275,7 +291,8 @@ fn looked_for(
         Ok(())
     };
     let mut pass = |_: &[usize], shots: Vec<Shot>, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut observe)?);
-    let found = Anywhere { engine, model, open, starts }.search(&sightings(engine, model, instance, &photo(frame)?)?, &mut pass);
+    let sightings = Sightings::of(engine, model, instance, &photo(frame)?)?;
+    let found = Anywhere { engine, model, open, starts }.search(&sightings, &mut pass);
     bar.finish_and_clear();
     let nothing = || format!("{}: nothing in it looks like {}", frame.display(), model.instance_name(instance));
     let Outcome { shot, found, .. } = found?.ok_or_else(nothing)?;

@@ -1,10 +1,10 @@
 //! Photographs with boxes around their objects: what in a box is the object and where the object is are found in turns.
 
 use glam::DMat4;
-use srn_photo::Known;
+use srn_photo::{BoundingBox, Known};
 
 use super::follow::cut_out;
-use super::{FoundObject, Open, Shot, Sighting};
+use super::{FoundObject, Open, Shot, Sighting, Sightings};
 use crate::camera::{fixed24, neighbor4};
 use crate::renderer::render_views;
 use crate::{Engine, Error, Found, Intrinsics, Model, View};
@@ -16,7 +16,9 @@ const WHITE: f32 = 0.9;
 
 /// Room around what seems to be the object, as a share of the longer side of its box: what sticks out of it may be missing there.
 const ROOM: f64 = 0.15;
-/// At so many places where it seems to be the object is searched for once more, by its colours.
+/// At so many places where it seems to be the object is searched for,
+const PLACES: usize = 5;
+/// and at so many once more, by its colours.
 const AGAIN: usize = 2;
 
 /// What came of a search.
@@ -125,37 +127,24 @@ pub struct Anywhere<'a, E> {
 }
 
 impl<E: From<Error>> Anywhere<'_, E> {
-    /// Searches at each of the places where the object seems to be, the likeliest first, until a pose is to be trusted; if none is, once more by the colours of the model's object where the least is
-    /// left unexplained, which counts. `None` where no place differs from what is around it.
-    pub fn search<L>(self, sightings: &[Sighting], pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
-        let Anywhere { engine, model, open, starts } = self;
-        let (mut outcomes, mut seconds) = (Vec::new(), 0.0);
-        for Sighting { object, bounds } in sightings {
-            let bounds = bounds.with_room(ROOM);
-            let open_it = |_, known: Known| open(bounds, known);
-            let boxed = Boxed { engine, model, open: &open_it, starts: &|_, shot| starts(shot) };
-            let Ok(shot) = cut_out(bounds, object, open) else { continue };
-            for outcome in boxed.in_turns(&[0], vec![shot], &mut *pass)? {
-                seconds += outcome.found.seconds;
-                outcomes.push((bounds, outcome));
-            }
-            if outcomes.last().is_some_and(|(_, outcome)| outcome.found.is_trusted()) {
-                break;
-            }
+    /// Searches at each of the places where the object seems to be, the likeliest first, until a pose is to be trusted, and nothing that looks more like the object ([`Sightings::rival`]) leads to a better
+    /// one; if none is, once more by the colours of the model's object where the least is left unexplained, which counts. `None` where no place differs from what is around it.
+    pub fn search<L>(&self, sightings: &Sightings, pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
+        let mut outcomes = self.until(sightings, PLACES, Found::is_trusted, &mut *pass)?;
+        let mut seconds: f64 = outcomes.iter().map(|(_, outcome)| outcome.found.seconds).sum();
+        if let Some((_, Outcome { shot, found, log })) = outcomes.pop_if(|(_, outcome)| outcome.found.is_trusted()) {
+            return Ok(Some(Outcome { shot, found: Found { seconds, ..found }, log }));
         }
-        let order = |(_, a): &(_, Outcome<L>), (_, b): &(_, Outcome<L>)| {
-            let trusted = b.found.is_trusted().cmp(&a.found.is_trusted());
-            trusted.then(a.found.unexplained.total_cmp(&b.found.unexplained))
-        };
-        outcomes.sort_by(order);
+        outcomes.sort_by(|(_, a), (_, b)| a.found.unexplained.total_cmp(&b.found.unexplained));
         let mut best = None::<Outcome<L>>;
         for (bounds, outcome) in outcomes.into_iter().take(AGAIN) {
-            let before = outcome.found.seconds;
-            let open_it = |_, known: Known| open(bounds, known);
-            let boxed = Boxed { engine, model, open: &open_it, starts: &|_, shot| starts(shot) };
-            for outcome in boxed.by_colours(&[0], vec![outcome], &mut *pass)? {
+            seconds -= outcome.found.seconds;
+            for mut outcome in self.at(bounds, |boxed| boxed.by_colours(&[0], vec![outcome], &mut *pass))? {
+                if outcome.found.is_trusted() {
+                    outcome = self.or_rival(sightings, outcome, &mut *pass)?;
+                }
                 let Outcome { found, .. } = &outcome;
-                seconds += found.seconds - before;
+                seconds += found.seconds;
                 if found.is_trusted() || best.as_ref().is_none_or(|best| found.unexplained < best.found.unexplained) {
                     best = Some(outcome);
                 }
@@ -166,5 +155,63 @@ impl<E: From<Error>> Anywhere<'_, E> {
         }
         best.iter_mut().for_each(|best| best.found.seconds = seconds);
         Ok(best)
+    }
+
+    /// What is found at each of so many places, in this order, until that is it; with the boxes that were looked into.
+    pub(super) fn until<L>(
+        &self,
+        sightings: &Sightings,
+        places: usize,
+        is_it: impl Fn(&Found) -> bool,
+        pass: Pass<L, E>,
+    ) -> Result<Vec<(BoundingBox, Outcome<L>)>, E> {
+        let mut outcomes = Vec::new();
+        for sighting in sightings.likeliest(places) {
+            let Some((bounds, mut outcome)) = self.around(&sighting, self.starts, &mut *pass)? else { continue };
+            if is_it(&outcome.found) {
+                outcome = self.or_rival(sightings, outcome, &mut *pass)?;
+            }
+            let is_it = is_it(&outcome.found);
+            outcomes.push((bounds, outcome));
+            if is_it {
+                break;
+            }
+        }
+        Ok(outcomes)
+    }
+
+    /// What looks like the object from another side, too, is searched for from there; what of both has more in the photograph that speaks for it counts.
+    fn or_rival<L>(&self, sightings: &Sightings, outcome: Outcome<L>, pass: Pass<L, E>) -> Result<Outcome<L>, E> {
+        let Outcome { shot, found, .. } = &outcome;
+        let Some(rival) = sightings.rival(shot, &found.world_from_camera)? else { return Ok(outcome) };
+        let near = |shot: &Shot| Ok(neighbor4(&shot.facing(self.model, &rival.side)?));
+        let Some((_, mut other)) = self.around(&rival, &near, pass)? else { return Ok(outcome) };
+        let evidence = |Outcome { shot, found, .. }: &Outcome<L>| sightings.evidence(shot, &found.world_from_camera);
+        let (seconds, is_more) = (found.seconds + other.found.seconds, evidence(&other)? > evidence(&outcome)?);
+        if is_more {
+            other.found.seconds = seconds;
+            return Ok(other);
+        }
+        Ok(Outcome { found: Found { seconds, ..outcome.found }, ..outcome })
+    }
+
+    /// What is found at a place, in a box there, which comes too; `None` where nothing in it differs from what is around it.
+    fn around<L>(
+        &self,
+        Sighting { object, bounds, .. }: &Sighting,
+        starts: &dyn Fn(&Shot) -> Result<Vec<DMat4>, E>,
+        pass: Pass<L, E>,
+    ) -> Result<Option<(BoundingBox, Outcome<L>)>, E> {
+        let bounds = bounds.with_room(ROOM);
+        let Ok(shot) = cut_out(bounds, object, self.open) else { return Ok(None) };
+        let there = Anywhere { starts, ..*self };
+        let found = there.at(bounds, |boxed| boxed.in_turns(&[0], vec![shot], pass))?;
+        Ok(found.into_iter().next().map(|outcome| (bounds, outcome)))
+    }
+
+    /// At one of them.
+    fn at<T>(&self, bounds: BoundingBox, search: impl FnOnce(&Boxed<E>) -> T) -> T {
+        let &Anywhere { engine, model, open, starts } = self;
+        search(&Boxed { engine, model, open: &|_, known| open(bounds, known), starts: &|_, shot| starts(shot) })
     }
 }

@@ -3,13 +3,17 @@
 use glam::DMat4;
 use srn_photo::{BoundingBox, Known};
 
-use super::{Boxed, FoundObject, Outcome, Shot};
+use super::{Anywhere, Boxed, FoundObject, Outcome, Shot, Sightings};
 use crate::{Engine, Error, Found, Model, Progress, Search, Tracked, Tracker};
 
 /// A frame is cut out anew by the pose that was found in it where what this covers and what was expected have no more than so much of both in common.
 const AS_EXPECTED: f64 = 0.9;
 /// As long as poses are not to be trusted, the object is searched for all around in every so many frames.
 const SEARCHED: usize = 10;
+/// Where it may be elsewhere is looked for at so many places.
+const PLACES: usize = 2;
+/// What is found elsewhere leaves at most so many times unexplained what the object did where it was last seen: other things look like it, too.
+const ABOVE_SURE: f64 = 1.5;
 
 /// A frame, cut out by a box and what is known of the object in it.
 pub type Open<'a, E> = &'a dyn Fn(BoundingBox, Known) -> Result<Shot, E>;
@@ -20,12 +24,20 @@ pub type Observe<'a> = &'a mut dyn FnMut(Progress) -> Result<(), Error>;
 pub struct Follower {
     /// A box around the object, where it was last seen for sure.
     bounds: BoundingBox,
-    /// What it covered there, and the pose.
-    sure: Option<(FoundObject, DMat4)>,
+    /// How it was seen there.
+    sure: Option<Sure>,
     /// What it is expected to cover in the next frame, and a box around that.
     expected: Option<(FoundObject, BoundingBox)>,
     /// Frames in a row whose poses were not to be trusted.
     doubted: usize,
+}
+
+/// An object seen for sure.
+struct Sure {
+    /// What it covered.
+    object: FoundObject,
+    pose: DMat4,
+    unexplained: f64,
 }
 
 /// How frames are looked at.
@@ -40,6 +52,8 @@ pub struct Looking<'a, E> {
     pub starts: &'a dyn Fn(&Shot) -> Result<Vec<DMat4>, E>,
     /// The frame at hand.
     pub open: Open<'a, E>,
+    /// Where in it the object may be.
+    pub sightings: &'a dyn Fn() -> Result<Sightings<'a>, E>,
 }
 
 impl Follower {
@@ -54,54 +68,64 @@ impl Follower {
         expected.map_or_else(|| open(self.bounds, Known::default()), Ok)
     }
 
-    /// Finds the pose in a frame that [`Follower::open`] has cut out; the frame comes back as it was cut out in the end.
+    /// Finds the pose in a frame that [`Follower::open`] has cut out; where it could not, the object may be elsewhere. The frame comes back as it was cut out in the end; `None` where that was nowhere.
     pub fn next<E: From<Error>>(
         &mut self,
-        shot: Shot,
+        shot: Option<Shot>,
         tracker: &mut Tracker,
         looking: &Looking<E>,
         observe: Observe,
-    ) -> Result<(Shot, Tracked), E> {
-        let mut near = self.near(&shot, tracker, looking, observe)?;
+    ) -> Result<Option<(Shot, Tracked)>, E> {
+        let mut near = match &shot {
+            Some(shot) => self.near(shot, tracker, looking, observe)?,
+            None => None,
+        };
+        let is_sure = |found: &Option<(Shot, Found)>| found.as_ref().is_some_and(|(_, found)| found.is_trusted());
         // What hid it may be gone.
         if self.doubted > 0
-            && near.as_ref().is_some_and(|(_, found)| !found.is_trusted())
+            && near.is_some()
+            && !is_sure(&near)
             && let Some(back) = self.back(tracker, looking, observe)?
         {
             tracker.restart(back.1.world_from_camera);
             near = Some(back);
         }
-        let is_due = |found: &Found| !found.is_trusted() && self.doubted.is_multiple_of(SEARCHED);
-        let around = match &near {
-            Some((_, found)) if is_due(found) => (looking.open)(self.bounds, Known::default()).ok(),
-            Some(_) => None,
-            None => Some(shot),
+        let is_due = !is_sure(&near) && self.doubted.is_multiple_of(SEARCHED);
+        let is_gone = self.doubted > 0 || shot.is_none();
+        let around = match shot {
+            Some(_) if is_due && near.is_some() => (looking.open)(self.bounds, Known::default()).ok(),
+            Some(_) if near.is_some() => None,
+            shot => shot,
         };
         let around = around.map(|shot| self.around(shot, looking, observe)).transpose()?;
         let is_better = |(_, other): &(Shot, Found)| {
             other.is_trusted() || near.as_ref().is_none_or(|(_, found)| other.unexplained < found.unexplained)
         };
-        let around = around.filter(is_better);
-        let is_searched = around.is_some();
-        let Some((shot, found)) = around.or(near) else {
-            return Err(Error::Input { input: "frame".into(), what: "no pose was looked for".into() }.into());
-        };
+        let mut searched = around.filter(is_better);
+        if is_due && is_gone && !is_sure(&searched) {
+            searched = self.elsewhere(looking, observe)?.or(searched);
+        }
+        let is_searched = searched.is_some();
+        self.doubted += 1;
+        let Some((shot, found)) = searched.or(near) else { return Ok(None) };
         if is_searched {
             tracker.restart(found.world_from_camera);
         }
-        self.doubted = if found.is_trusted() { 0 } else { self.doubted + 1 };
         let next = tracker.expected().unwrap_or(found.world_from_camera);
         let object = FoundObject::of(&shot, &next, looking.engine, looking.model, 1)?;
+        if found.is_trusted() {
+            self.doubted = 0;
+        }
         if let Some(bounds) = object.bounds() {
             // What is followed in doubt may be something else, which leads away.
             if found.is_trusted() {
                 self.bounds = bounds;
                 let there = FoundObject::of(&shot, &found.world_from_camera, looking.engine, looking.model, 1)?;
-                self.sure = Some((there, found.world_from_camera));
+                self.sure = Some(Sure { object: there, pose: found.world_from_camera, unexplained: found.unexplained });
             }
             self.expected = Some((object, bounds));
         }
-        Ok((shot, Tracked { found, is_searched }))
+        Ok(Some((shot, Tracked { found, is_searched })))
     }
 
     /// From where it is expected.
@@ -132,15 +156,25 @@ impl Follower {
         looking: &Looking<E>,
         observe: Observe,
     ) -> Result<Option<(Shot, Found)>, E> {
-        let Some((object, pose)) = &self.sure else { return Ok(None) };
+        let Some(Sure { object, pose, .. }) = &self.sure else { return Ok(None) };
         let Ok(shot) = cut_out(self.bounds, object, looking.open) else { return Ok(None) };
         let found = tracker.from(*pose, shot.query(vec![]), observe)?;
         Ok(found.is_trusted().then_some((shot, found)))
     }
 
+    /// From all around, anywhere in the frame, if it is seen there as surely as where it was last seen for sure.
+    fn elsewhere<E: From<Error>>(&self, looking: &Looking<E>, observe: Observe) -> Result<Option<(Shot, Found)>, E> {
+        let Some(Sure { unexplained, .. }) = self.sure else { return Ok(None) };
+        let Looking { engine, model, search, starts, open, sightings } = *looking;
+        let is_it = |found: &Found| found.is_trusted() && found.unexplained <= ABOVE_SURE * unexplained;
+        let mut pass = |_: &[usize], shots, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut *observe)?);
+        let outcomes = Anywhere { engine, model, open, starts }.until(&sightings()?, PLACES, is_it, &mut pass)?;
+        Ok(outcomes.into_iter().map(|(_, Outcome { shot, found, .. })| (shot, found)).find(|(_, found)| is_it(found)))
+    }
+
     /// From all around, of a frame that was cut out by the box alone.
     fn around<E: From<Error>>(&self, shot: Shot, looking: &Looking<E>, observe: Observe) -> Result<(Shot, Found), E> {
-        let Looking { engine, model, search, starts, open } = *looking;
+        let Looking { engine, model, search, starts, open, .. } = *looking;
         let boxed = Boxed { engine, model, open: &|_, known| open(self.bounds, known), starts: &|_, shot| starts(shot) };
         let mut pass = |_: &[usize], shots, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut *observe)?);
         let Outcome { shot, found, .. } = boxed.search(&[0], vec![shot], &mut pass)?.remove(0);

@@ -10,7 +10,7 @@ mod template;
 pub use boxed::{Anywhere, Boxed, Outcome, Pass, StartsOf};
 pub use follow::{Follower, Looking, Observe, Open};
 pub use shown::FoundObject;
-pub use sightings::{Sighting, sightings};
+pub use sightings::{Sighting, Sightings};
 pub use srn_photo::{BoundingBox, Guess, Known, MARGIN, Photo, Pixels, Square};
 
 use glam::{DMat4, DQuat, DVec3};
@@ -153,7 +153,7 @@ impl Search {
         Ok((shot, found))
     }
 
-    /// The same where nothing is known of where in the photograph the object is: where it seems to be ([`sightings`], [`Anywhere`]).
+    /// The same where nothing is known of where in the photograph the object is: where it seems to be ([`Sightings`], [`Anywhere`]).
     pub fn run_anywhere(
         &self,
         engine: &Engine,
@@ -167,7 +167,7 @@ impl Search {
         let open = |bounds, known: Known| in_box(model, instance, photo, bounds, known);
         let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
         let anywhere = Anywhere { engine, model, open: &open, starts: &starts };
-        let found = anywhere.search(&sightings(engine, model, instance, photo.0)?, &mut pass)?;
+        let found = anywhere.search(&Sightings::of(engine, model, instance, photo.0)?, &mut pass)?;
         let nothing = || Error::Input { input: "photograph".into(), what: "nothing in it differs from what is around it".into() };
         found.map(|Outcome { shot, found, .. }| (shot, found)).ok_or_else(nothing)
     }

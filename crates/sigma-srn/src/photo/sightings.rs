@@ -4,14 +4,14 @@
 use std::f32::consts::TAU;
 use std::iter::zip;
 
-use glam::{Vec3, Vec4, Vec4Swizzles};
+use glam::{DMat4, DVec3, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
 use srn_photo::{Photo, Pixels};
 use srn_shaders::LinearParams;
 
 use super::template::{Cell, ROLL, ROLLS, SIDE, Template, WIDER, coarse, rolled_view};
-use super::{BoundingBox, FoundObject};
-use crate::camera::around2016;
+use super::{BoundingBox, FoundObject, Shot};
+use crate::camera::{around2016, pose_error};
 use crate::renderer::render_views;
 use crate::{Engine, Error, Intrinsics, Model, View};
 
@@ -31,18 +31,35 @@ const SUREST: f32 = 5.0;
 const MOST: f32 = 4.0;
 /// Logarithm of the odds beyond the picture's edge.
 const OUTSIDE: f32 = -2.0;
-/// A larger thing is less likely to look like the object by chance: the power of its size that counts.
-const SIZE: f32 = 0.3;
+/// A larger thing is less likely to look like the object by chance: the power of its area that counts.
+const AREA: f32 = 0.15;
 
-/// How many are left after each look: of each size, of all, of these moved a little, and in the end.
+/// How many are left after each look: of each size, of all, and of these moved a little.
 const OF_SIZE: usize = 900;
 const BEST: usize = 500;
 const BETTER: usize = 200;
-const LIKELIEST: usize = 5;
 /// Templates at a place that go on.
 const AT_PLACE: usize = 3;
 /// Two that have more than this part of both boxes in common are one.
 const SAME: f64 = 0.4;
+/// Degrees between sides that are not the same, and by which those next to a side are turned.
+const ELSEWHERE_DEG: f64 = 30.0;
+const TILT_DEG: f64 = 12.0;
+
+/// A photograph as it was looked at for an object, and where that may be.
+pub struct Sightings<'a> {
+    engine: &'a Engine,
+    model: &'a Model,
+    instance: u32,
+    looked: Looked,
+    /// So many pixels of what is looked at are one of the photograph.
+    finer: f64,
+    /// The model's, and the cameras that see them.
+    views: Vec<Vec<f32>>,
+    cameras: Vec<DMat4>,
+    /// The likeliest first.
+    matches: Vec<Match>,
+}
 
 /// Where in a photograph the object may be.
 pub struct Sighting {
@@ -50,6 +67,8 @@ pub struct Sighting {
     pub object: FoundObject,
     /// A box around that.
     pub bounds: BoundingBox,
+    /// A `world_from_camera` that sees it from the same side, in the middle of its picture.
+    pub side: DMat4,
 }
 
 /// Where a template fits.
@@ -66,34 +85,94 @@ struct Match {
     evidence: f32,
 }
 
-/// Where in a photograph the object may be, the likeliest place first. It is found where its diagonal is an eleventh or more of the photograph's longer side.
-pub fn sightings(engine: &Engine, model: &Model, instance: u32, photo: &Photo) -> Result<Vec<Sighting>, Error> {
-    let radius = model.metadata.orbit_radius.unwrap_or(1.3);
-    let (focal, middle) = (SIDE as f64 * radius / WIDER, 0.5 * SIDE as f64);
-    let camera = Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.5 };
-    let cameras = around2016(radius).into_iter().step_by(ROLLS);
-    let views: Vec<View> = cameras.map(|pose| (instance, pose, camera)).collect();
-    let views = render_views(engine, model, [SIDE as u32; 2], &views)?;
-    let views: Vec<Vec<f32>> = views.into_iter().map(|view| view.rgb).collect();
-    let size = photo.size().map(|pixels| pixels as f64);
-    let finer = (FINEST / size[0].max(size[1])).min(1.0);
-    let [width, height] = size.map(|pixels| (finer * pixels).round().max(1.0) as usize);
-    let found = Looked::at(photo.pixels().area_resample(width, height)).matches(&views);
-    let mut sightings: Vec<Sighting> = Vec::new();
-    for Match { middle, diagonal, template, roll, .. } in found {
-        let wide = WIDER * f64::from(diagonal) / finer;
-        let corner = middle.map(|at| f64::from(at) / finer - 0.5 * wide);
-        let view = rolled_view(&views[template / ROLLS], roll);
-        let object = FoundObject::in_square(&view, SIDE, corner, wide);
-        let Some(bounds) = object.bounds() else { continue };
-        if sightings.iter().all(|other| bounds.overlap(&other.bounds) < SAME) {
-            sightings.push(Sighting { object, bounds });
-        }
-        if sightings.len() == LIKELIEST {
-            break;
-        }
+impl<'a> Sightings<'a> {
+    /// Of an instance of `model`. It is found where its diagonal is an eleventh or more of the photograph's longer side.
+    pub fn of(engine: &'a Engine, model: &'a Model, instance: u32, photo: &Photo) -> Result<Self, Error> {
+        let radius = model.metadata.orbit_radius.unwrap_or(1.3);
+        let (focal, middle) = (SIDE as f64 * radius / WIDER, 0.5 * SIDE as f64);
+        let camera = Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.5 };
+        let cameras: Vec<DMat4> = around2016(radius).into_iter().step_by(ROLLS).collect();
+        let views: Vec<View> = cameras.iter().map(|pose| (instance, *pose, camera)).collect();
+        let views = render_views(engine, model, [SIDE as u32; 2], &views)?;
+        let views: Vec<Vec<f32>> = views.into_iter().map(|view| view.rgb).collect();
+        let size = photo.size().map(|pixels| pixels as f64);
+        let finer = (FINEST / size[0].max(size[1])).min(1.0);
+        let [width, height] = size.map(|pixels| (finer * pixels).round().max(1.0) as usize);
+        let looked = Looked::at(photo.pixels().area_resample(width, height));
+        let matches = looked.matches(&views);
+        Ok(Sightings { engine, model, instance, looked, finer, views, cameras, matches })
     }
-    Ok(sightings)
+
+    /// The likeliest places, the likeliest first, at most so many.
+    pub fn likeliest(&self, most: usize) -> Vec<Sighting> {
+        let mut likeliest: Vec<Sighting> = Vec::new();
+        for sighting in self.matches.iter().filter_map(|found| self.sighting(found)) {
+            if likeliest.len() == most {
+                break;
+            }
+            if likeliest.iter().all(|other| sighting.bounds.overlap(&other.bounds) < SAME) {
+                likeliest.push(sighting);
+            }
+        }
+        likeliest
+    }
+
+    /// What looks more like the object than it does from a pose that was found in a part of the photograph: the same turned a little, or what was sighted there from another side.
+    pub fn rival(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<Option<Sighting>, Error> {
+        let seen_from = |pose: &DMat4| FoundObject::of(shot, pose, self.engine, self.model, 1);
+        let Some(bounds) = seen_from(world_from_camera)?.bounds() else { return Ok(None) };
+        let (mut most, mut best) = (self.evidence(shot, world_from_camera)?, None);
+        for (axis, degrees) in [DVec3::X, DVec3::Y].into_iter().flat_map(|axis| [(axis, TILT_DEG), (axis, -TILT_DEG)]) {
+            let tilt = DMat4::from_axis_angle(world_from_camera.transform_vector3(axis), degrees.to_radians());
+            let side = tilt * *world_from_camera;
+            let evidence = self.evidence(shot, &side)?;
+            if evidence > most
+                && let object = seen_from(&side)?
+                && let Some(bounds) = object.bounds()
+            {
+                (most, best) = (evidence, Some(Sighting { object, bounds, side }));
+            }
+        }
+        let facing = shot.facing(self.model, world_from_camera)?;
+        for found in self.matches.iter().take_while(|found| found.evidence > most) {
+            if let Some(sighting) = self.sighting(found)
+                && sighting.bounds.overlap(&bounds) >= SAME
+                && pose_error(&facing, &shot.facing(self.model, &sighting.side)?).0 > ELSEWHERE_DEG
+            {
+                return Ok(Some(sighting));
+            }
+        }
+        Ok(best)
+    }
+
+    /// How much speaks for a pose that was found in a part of the photograph.
+    pub fn evidence(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<f32, Error> {
+        let Intrinsics { fx, fy, cx, cy, pixel_center } = shot.intrinsics;
+        let object = world_from_camera.inverse().transform_point3(DVec3::ZERO);
+        // Edges of pixels are whole numbers.
+        let [cx, cy] = [cx, cy].map(|c| c - pixel_center + 0.5);
+        let middle = [fx * object.x / object.z + cx, fy * object.y / object.z + cy];
+        let diagonal = fx / object.length();
+        let (wide, cells) = (WIDER * diagonal, SIDE as f64);
+        let [cx, cy] = [[cx, middle[0]], [cy, middle[1]]].map(|[c, middle]| cells * ((c - middle) / wide + 0.5));
+        let camera = Intrinsics { fx: cells * fx / wide, fy: cells * fy / wide, cx, cy, pixel_center: 0.5 };
+        let view = &render_views(self.engine, self.model, [SIDE as u32; 2], &[(self.instance, *world_from_camera, camera)])?[0];
+        let (corner, pixels) = (shot.square.0, shot.pixels_of_photo());
+        let middle = [0, 1].map(|k| (self.finer * (corner[k] as f64 + pixels * middle[k])) as f32);
+        let diagonal = (self.finer * pixels * diagonal) as f32;
+        let at = Match { middle, diagonal, template: 0, roll: 0.0, evidence: 0.0 };
+        Ok(self.looked.judged(at, &Template::of(&view.rgb)).evidence)
+    }
+
+    /// `None` where the model shows nothing.
+    fn sighting(&self, &Match { middle, diagonal, template, roll, .. }: &Match) -> Option<Sighting> {
+        let wide = WIDER * f64::from(diagonal) / self.finer;
+        let corner = middle.map(|at| f64::from(at) / self.finer - 0.5 * wide);
+        let (view, camera) = (template / ROLLS, self.cameras[template / ROLLS]);
+        let object = FoundObject::in_square(&rolled_view(&self.views[view], roll), SIDE, corner, wide);
+        let bounds = object.bounds()?;
+        Some(Sighting { object, bounds, side: camera * DMat4::from_rotation_z(roll.into()) })
+    }
 }
 
 /// A picture as it is looked at.
@@ -180,7 +259,8 @@ impl Looked {
                 of_around.add(around.w, off(&seen, around).min(MOST));
             }
         }
-        let evidence = (of_own.mean() + of_around.mean()) * found.diagonal.powf(SIZE);
+        let own: f32 = template.cells.iter().map(|cell| cell.own.w).sum();
+        let evidence = (of_own.mean() + of_around.mean()) * (own * cell * cell).powf(AREA);
         Match { evidence, ..found }
     }
 }
