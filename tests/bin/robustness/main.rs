@@ -25,7 +25,7 @@ use crate::video::Video;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [rooms] [others] [sides] [video] [captures] [--seed N] [--starts STARTS]";
+const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [rooms] [others] [sides] [video] [leaving] [captures] [--seed N] [--starts STARTS]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -203,6 +203,7 @@ fn main() -> ExitCode {
 
 fn run() -> Result<()> {
     let (mut wanted, mut has_sides, mut has_video, mut has_captures) = (Vec::new(), false, false, false);
+    let mut has_leaving = false;
     let (mut seed, mut starts) = (23, "around2016".to_string());
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
@@ -211,12 +212,13 @@ fn run() -> Result<()> {
             "--starts" => starts = arguments.next().ok_or(USAGE)?,
             "sides" => has_sides = true,
             "video" => has_video = true,
+            "leaving" => has_leaving = true,
             "captures" => has_captures = true,
             name => wanted.push(TABLES.iter().find(|table| table.name == name).ok_or(USAGE)?),
         }
     }
-    if wanted.is_empty() && !has_sides && !has_video && !has_captures {
-        (wanted, has_sides, has_video, has_captures) = (TABLES.iter().collect(), true, true, true);
+    if wanted.is_empty() && ![has_sides, has_video, has_leaving, has_captures].contains(&true) {
+        (wanted, has_sides, has_video, has_leaving, has_captures) = (TABLES.iter().collect(), true, true, true, true);
     }
     let programs = Programs { folder: std::env::current_exe()?.parent().ok_or("no folder")?.into(), starts };
     let mut shown = Vec::new();
@@ -258,6 +260,9 @@ fn run() -> Result<()> {
     }
     if has_video {
         videos(&programs, seed)?;
+    }
+    if has_leaving {
+        leaving(&programs, seed)?;
     }
     if has_captures {
         captures(&programs, seed)?;
@@ -301,6 +306,25 @@ fn videos(programs: &Programs, seed: u64) -> Result<()> {
     for object in 0..OBJECTS.len() {
         let video = Video::new(object, &folder, &mut random)?;
         println!("{}", video::tracked(programs, &video, "normal")?);
+    }
+    Ok(())
+}
+
+/// The table of videos that an object leaves.
+fn leaving(programs: &Programs, seed: u64) -> Result<()> {
+    println!("\nleaving, seed {seed}, made in {OUT}\n");
+    println!(
+        "| | effort | trusted, of these wrong, before | trusted while it is away | found so many frames after it is back | \
+         trusted, of these wrong, since it is back | longest frame while away |\n|---|---|---|---|---|---|---|"
+    );
+    let folder = Path::new(OUT).join("views-of-leaving");
+    let [views, focal] = [video::VIEWS.to_string(), FOCAL_OF_ROOM.to_string()];
+    let flags = [("--cameras", "spiral"), ("--views", &*views), ("--focal", &*focal), ("--radius", "3")];
+    programs.rendered(&folder, SIDE, &flags)?;
+    let mut random = Pcg64Mcg::seed_from_u64(seed);
+    for object in 0..OBJECTS.len() {
+        let video = Video::leaving(object, &folder, &mut random)?;
+        println!("{}", video::back(programs, &video, "fast")?);
     }
     Ok(())
 }

@@ -17,6 +17,14 @@ const WHITE: f64 = 250.0;
 
 /// A room as a camera sees it, and how that is turned against the one that sees the object in the middle: from the new axes to the old ones.
 pub fn room(object: &RgbImage, others: &[RgbImage], random: &mut Pcg64Mcg) -> Result<(RgbImage, DMat3)> {
+    let mut room = table(others, random)?;
+    let turn = towards(SIZE.map(|size| random.random_range(INSIDE..size - INSIDE)));
+    draw(object, turn, &mut room);
+    Ok((room, turn))
+}
+
+/// The table, with others on it.
+pub fn table(others: &[RgbImage], random: &mut Pcg64Mcg) -> Result<RgbImage> {
     let (white, mut room) = (RgbImage::from_pixel(SIDE, SIDE, Rgb([255; 3])), RgbImage::new(SIZE[0], SIZE[1]));
     for (left, top) in (0..SIZE[0]).step_by(SIDE as usize).flat_map(|x| (0..SIZE[1]).step_by(SIDE as usize).map(move |y| (x, y)))
     {
@@ -27,19 +35,17 @@ pub fn room(object: &RgbImage, others: &[RgbImage], random: &mut Pcg64Mcg) -> Re
         let at = SIZE.map(|size| random.random_range(0..size));
         draw(other, towards(at), &mut room);
     }
-    let turn = towards(SIZE.map(|size| random.random_range(INSIDE..size - INSIDE)));
-    draw(object, turn, &mut room);
-    Ok((room, turn))
+    Ok(room)
 }
 
 /// How a camera is turned that sees at this pixel what was in the middle.
-fn towards(at: [u32; 2]) -> DMat3 {
+pub fn towards(at: [u32; 2]) -> DMat3 {
     let [x, y] = [0, 1].map(|k| (f64::from(at[k]) - 0.5 * f64::from(SIZE[k])) / FOCAL_OF_ROOM);
     DMat3::from_quat(DQuat::from_rotation_arc(DVec3::new(x, y, 1.0).normalize(), DVec3::Z))
 }
 
 /// What a view on white, with the object in its middle, shows through a camera that is turned.
-fn draw(view: &RgbImage, turn: DMat3, room: &mut RgbImage) {
+pub fn draw(view: &RgbImage, turn: DMat3, room: &mut RgbImage) {
     for (u, v, pixel) in room.enumerate_pixels_mut() {
         let [x, y] = [(u, SIZE[0]), (v, SIZE[1])].map(|(at, size)| (f64::from(at) - 0.5 * f64::from(size)) / FOCAL_OF_ROOM);
         let ray = turn * DVec3::new(x, y, 1.0);
