@@ -105,8 +105,8 @@ impl Video {
         std::fs::write(folder.join("intrinsics.txt"), intrinsics)?;
         for k in 0..ENDS {
             let view = FRAMES.start + k;
-            let [x, y] = PLACES[usize::from(k >= LEAVES)];
-            let (turn, mut frame) = (towards([x + SPEED * (k % LEAVES) as u32, y]), table.clone());
+            let (since, [x, y]) = if k < LEAVES { (k, PLACES[0]) } else { (k.saturating_sub(BACK), PLACES[1]) };
+            let (turn, mut frame) = (towards([x + SPEED * since as u32, y]), table.clone());
             if !(LEAVES..BACK).contains(&k) {
                 draw(&rendered(name, view)?, turn, &mut frame);
             }

@@ -8,7 +8,7 @@ use clap::Args;
 use glam::DMat4;
 use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::photo::{Anywhere, Boxed, Known, Outcome, Shot, Sightings};
+use sigma_srn::photo::{Anywhere, Boxed, Known, Outcome, PLACES, Shot, Sightings};
 use sigma_srn::{Confidence, Doubt, Engine, Error, Found, Light, Model, Pose6, Progress, Search};
 use srn_data::camera::Axes;
 use srn_data::target::photo;
@@ -321,7 +321,7 @@ impl Looking<'_> {
             pass(&shots.into_iter().map(|shot| Picture { shot, ..picture.clone() }).collect::<Vec<_>>(), starts)
         };
         let starts = |shot: &Shot| self.starts_of(shot, given);
-        let anywhere = Anywhere { engine: on.engine, model: on.model, open: &open, starts: &starts };
+        let anywhere = Anywhere { engine: on.engine, model: on.model, open: &open, starts: &starts, places: PLACES };
         let found = anywhere.search(&sightings, &mut named)?;
         // Where nothing differs from anything, it is the picture as it is.
         match found {

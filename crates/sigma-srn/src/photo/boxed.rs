@@ -16,9 +16,7 @@ const WHITE: f32 = 0.9;
 
 /// Room around what seems to be the object, as a share of the longer side of its box: what sticks out of it may be missing there.
 const ROOM: f64 = 0.15;
-/// At so many places where it seems to be the object is searched for,
-const PLACES: usize = 5;
-/// and at so many once more, by its colours.
+/// At so many places where it seems to be the object is searched for once more, by its colours.
 const AGAIN: usize = 2;
 
 /// What came of a search.
@@ -124,13 +122,27 @@ pub struct Anywhere<'a, E> {
     pub open: Open<'a, E>,
     /// Where searches start.
     pub starts: &'a dyn Fn(&Shot) -> Result<Vec<DMat4>, E>,
+    /// At how many places it is searched for at most: [`PLACES`].
+    pub places: usize,
 }
+
+/// At so many places where it seems to be an object is found that is found at all.
+pub const PLACES: usize = 5;
 
 impl<E: From<Error>> Anywhere<'_, E> {
     /// Searches at each of the places where the object seems to be, the likeliest first, until a pose is to be trusted, and nothing that looks more like the object ([`Sightings::rival`]) leads to a better
     /// one; if none is, once more by the colours of the model's object where the least is left unexplained, which counts. `None` where no place differs from what is around it.
     pub fn search<L>(&self, sightings: &Sightings, pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
-        let mut outcomes = self.until(sightings, PLACES, Found::is_trusted, &mut *pass)?;
+        let mut outcomes = Vec::new();
+        for sighting in sightings.likeliest(self.places) {
+            let Some((bounds, outcome)) = self.around(&sighting, self.starts, &mut *pass)? else { continue };
+            let outcome = self.or_rival(sightings, outcome, &mut *pass)?;
+            let is_found = outcome.found.is_trusted();
+            outcomes.push((bounds, outcome));
+            if is_found {
+                break;
+            }
+        }
         let mut seconds: f64 = outcomes.iter().map(|(_, outcome)| outcome.found.seconds).sum();
         if let Some((_, Outcome { shot, found, log })) = outcomes.pop_if(|(_, outcome)| outcome.found.is_trusted()) {
             return Ok(Some(Outcome { shot, found: Found { seconds, ..found }, log }));
@@ -139,10 +151,8 @@ impl<E: From<Error>> Anywhere<'_, E> {
         let mut best = None::<Outcome<L>>;
         for (bounds, outcome) in outcomes.into_iter().take(AGAIN) {
             seconds -= outcome.found.seconds;
-            for mut outcome in self.at(bounds, |boxed| boxed.by_colours(&[0], vec![outcome], &mut *pass))? {
-                if outcome.found.is_trusted() {
-                    outcome = self.or_rival(sightings, outcome, &mut *pass)?;
-                }
+            for outcome in self.at(bounds, |boxed| boxed.by_colours(&[0], vec![outcome], &mut *pass))? {
+                let outcome = self.or_rival(sightings, outcome, &mut *pass)?;
                 let Outcome { found, .. } = &outcome;
                 seconds += found.seconds;
                 if found.is_trusted() || best.as_ref().is_none_or(|best| found.unexplained < best.found.unexplained) {
@@ -157,32 +167,12 @@ impl<E: From<Error>> Anywhere<'_, E> {
         Ok(best)
     }
 
-    /// What is found at each of so many places, in this order, until that is it; with the boxes that were looked into.
-    pub(super) fn until<L>(
-        &self,
-        sightings: &Sightings,
-        places: usize,
-        is_it: impl Fn(&Found) -> bool,
-        pass: Pass<L, E>,
-    ) -> Result<Vec<(BoundingBox, Outcome<L>)>, E> {
-        let mut outcomes = Vec::new();
-        for sighting in sightings.likeliest(places) {
-            let Some((bounds, mut outcome)) = self.around(&sighting, self.starts, &mut *pass)? else { continue };
-            if is_it(&outcome.found) {
-                outcome = self.or_rival(sightings, outcome, &mut *pass)?;
-            }
-            let is_it = is_it(&outcome.found);
-            outcomes.push((bounds, outcome));
-            if is_it {
-                break;
-            }
-        }
-        Ok(outcomes)
-    }
-
-    /// What looks like the object from another side, too, is searched for from there; what of both has more in the photograph that speaks for it counts.
+    /// If it is trusted, what looks like the object from another side, too, is searched for from there; what of both has more in the photograph that speaks for it counts.
     fn or_rival<L>(&self, sightings: &Sightings, outcome: Outcome<L>, pass: Pass<L, E>) -> Result<Outcome<L>, E> {
         let Outcome { shot, found, .. } = &outcome;
+        if !found.is_trusted() {
+            return Ok(outcome);
+        }
         let Some(rival) = sightings.rival(shot, &found.world_from_camera)? else { return Ok(outcome) };
         let near = |shot: &Shot| Ok(neighbor4(&shot.facing(self.model, &rival.side)?));
         let Some((_, mut other)) = self.around(&rival, &near, pass)? else { return Ok(outcome) };
@@ -211,7 +201,7 @@ impl<E: From<Error>> Anywhere<'_, E> {
 
     /// At one of them.
     fn at<T>(&self, bounds: BoundingBox, search: impl FnOnce(&Boxed<E>) -> T) -> T {
-        let &Anywhere { engine, model, open, starts } = self;
+        let &Anywhere { engine, model, open, starts, .. } = self;
         search(&Boxed { engine, model, open: &|_, known| open(bounds, known), starts: &|_, shot| starts(shot) })
     }
 }

@@ -8,7 +8,7 @@ use crate::{Engine, Error, Found, Model, Progress, Search, Tracked, Tracker};
 
 /// A frame is cut out anew by the pose that was found in it where what this covers and what was expected have no more than so much of both in common.
 const AS_EXPECTED: f64 = 0.9;
-/// As long as poses are not to be trusted, the object is searched for all around in every so many frames.
+/// As long as poses are not to be trusted, the object is searched for in every so many frames: all around where it was last seen, and from the second time on, anywhere.
 const SEARCHED: usize = 10;
 /// Where it may be elsewhere is looked for at so many places.
 const PLACES: usize = 2;
@@ -91,9 +91,9 @@ impl Follower {
             near = Some(back);
         }
         let is_due = !is_sure(&near) && self.doubted.is_multiple_of(SEARCHED);
-        let is_gone = self.doubted > 0 || shot.is_none();
+        let is_gone = self.sure.is_some() && (self.doubted > 0 || shot.is_none());
         let around = match shot {
-            Some(_) if is_due && near.is_some() => (looking.open)(self.bounds, Known::default()).ok(),
+            Some(_) if is_due && !is_gone && near.is_some() => (looking.open)(self.bounds, Known::default()).ok(),
             Some(_) if near.is_some() => None,
             shot => shot,
         };
@@ -102,8 +102,8 @@ impl Follower {
             other.is_trusted() || near.as_ref().is_none_or(|(_, found)| other.unexplained < found.unexplained)
         };
         let mut searched = around.filter(is_better);
-        if is_due && is_gone && !is_sure(&searched) {
-            searched = self.elsewhere(looking, observe)?.or(searched);
+        if is_due && is_gone {
+            searched = searched.or(self.elsewhere(looking, observe)?);
         }
         let is_searched = searched.is_some();
         self.doubted += 1;
@@ -162,14 +162,14 @@ impl Follower {
         Ok(found.is_trusted().then_some((shot, found)))
     }
 
-    /// From all around, anywhere in the frame, if it is seen there as surely as where it was last seen for sure.
+    /// From anywhere in the frame, if it is seen there as surely as where it was last seen for sure.
     fn elsewhere<E: From<Error>>(&self, looking: &Looking<E>, observe: Observe) -> Result<Option<(Shot, Found)>, E> {
         let Some(Sure { unexplained, .. }) = self.sure else { return Ok(None) };
         let Looking { engine, model, search, starts, open, sightings } = *looking;
         let is_it = |found: &Found| found.is_trusted() && found.unexplained <= ABOVE_SURE * unexplained;
         let mut pass = |_: &[usize], shots, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut *observe)?);
-        let outcomes = Anywhere { engine, model, open, starts }.until(&sightings()?, PLACES, is_it, &mut pass)?;
-        Ok(outcomes.into_iter().map(|(_, Outcome { shot, found, .. })| (shot, found)).find(|(_, found)| is_it(found)))
+        let found = Anywhere { engine, model, open, starts, places: PLACES }.search(&sightings()?, &mut pass)?;
+        Ok(found.map(|Outcome { shot, found, .. }| (shot, found)).filter(|(_, found)| is_it(found)))
     }
 
     /// From all around, of a frame that was cut out by the box alone.
