@@ -160,13 +160,18 @@ impl Grid {
         (0..self.colours.len()).map(|i| of(place(i))).collect()
     }
 
-    /// Logarithm of the odds that a cell is the object, by a guess whose edge is off by some `pixels`.
+    /// Logarithm of the odds that a cell is the object, by a guess whose edge is off by some `pixels`; never against the guess, which of a narrow part is nothing but edge.
     fn prior(&self, guess: &[Option<bool>], pixels: f64) -> Vec<f64> {
         let [width, height] = self.size.map(|cells| cells as u32);
-        let guess = guess.iter().map(|guess| guess.map_or(0.5, |is_object| f32::from(u8::from(is_object)))).collect();
-        let guess: ImageBuffer<Luma<f32>, Vec<f32>> = ImageBuffer::from_vec(width, height, guess).unwrap_or_default();
-        let smooth = imageops::blur(&guess, (pixels / self.pitch[0]) as f32);
-        smooth.iter().map(|share| TRUST * (2.0 * f64::from(*share) - 1.0)).collect()
+        let shares = guess.iter().map(|guess| guess.map_or(0.5, |is_object| f32::from(u8::from(is_object)))).collect();
+        let shares: ImageBuffer<Luma<f32>, Vec<f32>> = ImageBuffer::from_vec(width, height, shares).unwrap_or_default();
+        let smooth = imageops::blur(&shares, (pixels / self.pitch[0]) as f32);
+        let odds = |(share, guess): (&f32, &Option<bool>)| match (TRUST * (2.0 * f64::from(*share) - 1.0), guess) {
+            (odds, Some(true)) => odds.max(0.0),
+            (odds, Some(false)) => odds.min(0.0),
+            (odds, None) => odds,
+        };
+        smooth.iter().zip(guess).map(odds).collect()
     }
 
     /// What a length of outline costs in each cell: little where the picture has an edge.
@@ -310,6 +315,28 @@ mod tests {
         let blue = [[-0.8, -0.6, 0.7], [-0.75, -0.55, 0.65], [-0.85, -0.65, 0.75]].repeat(20);
         let by_colours = found(Known { colours: &blue, place: None });
         assert!(wrong(&by_colours, is_middle) < area / 10, "{} of {area}", wrong(&by_colours, is_middle));
+    }
+
+    #[test]
+    fn a_narrow_part_stays_with_what_it_is_a_part_of() {
+        let mut picture = picture();
+        // A blue stalk below the disc, and things as blue to the left and the right of it.
+        let is_stalk = |i: usize| (58..62).contains(&(i % WIDTH)) && (54..66).contains(&(i / WIDTH));
+        let is_other = |i: usize| (24..32).contains(&(i % WIDTH).min(WIDTH - i % WIDTH)) && (50..70).contains(&(i / WIDTH));
+        for i in (0..WIDTH * picture.height).filter(|&i| is_stalk(i) || is_other(i)) {
+            let from = 3 * ((40 - i / WIDTH % 6) * WIDTH + 56 + i % 8);
+            picture.data.copy_within(from..from + 3, 3 * i);
+        }
+        for i in (0..WIDTH * picture.height).filter(|&i| from_middle(i) < 0.5) {
+            let from = 3 * (40 * WIDTH + 71 + i % 5);
+            picture.data.copy_within(from..from + 3, 3 * i);
+        }
+        let is_object = |i: usize| from_middle(i) < 1.0 || is_stalk(i);
+        let place = |[x, y]: [f64; 2]| Some(is_object(y as usize * WIDTH + x as usize));
+        let bounds = BoundingBox { corner: BOX.corner, size: [40.0, 41.0] };
+        let found = object_in(&picture, bounds, Known { place: Some(&place), ..Known::default() }).unwrap();
+        let lost = (0..found.len()).filter(|&i| is_stalk(i) && found[i] < 0.5).count();
+        assert!(lost < 10 && wrong(&found, is_object) < 40, "{lost} of 48, {} in all", wrong(&found, is_object));
     }
 
     #[test]

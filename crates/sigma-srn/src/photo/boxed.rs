@@ -1,13 +1,15 @@
 //! Photographs with boxes around their objects: what in a box is the object and where the object is are found in turns.
 
-use glam::DMat4;
+use std::borrow::Borrow;
+
+use glam::{DMat4, DVec2};
 use srn_photo::{BoundingBox, Known};
 
 use super::follow::cut_out;
 use super::{FoundObject, Open, Shot, Sighting, Sightings};
 use crate::camera::{fixed24, neighbor4};
 use crate::renderer::render_views;
-use crate::{Engine, Error, Found, Intrinsics, Model, View};
+use crate::{Engine, Error, Found, Intrinsics, Model, Outline, View};
 
 /// The model's object is looked at in pictures of so many pixels, for its colours.
 const SIDE: u32 = 32;
@@ -80,22 +82,44 @@ impl<E: From<Error>> Boxed<'_, E> {
         Ok(outcomes)
     }
 
-    /// A search, and one from where it ends.
+    /// A search, one from where it ends, and, where that says that its mask lacks something on a side, or has too much there, one more.
     fn in_turns<L>(&self, numbers: &[usize], shots: Vec<Shot>, pass: Pass<L, E>) -> Result<Vec<Outcome<L>>, E> {
         let starts = numbers.iter().zip(&shots).map(|(&number, shot)| (self.starts)(number, shot));
         let starts = starts.collect::<Result<Vec<_>, E>>()?;
         let first = pass(numbers, shots, &starts)?;
-        let mut anew = Vec::new();
-        for (&number, Outcome { shot, found, .. }) in numbers.iter().zip(&first) {
+        let mut second = self.cut_anew(numbers, &first, &mut *pass)?;
+        let is_one_sided = |Outline { cut, missing, .. }: Outline| (cut, missing) != (DVec2::ZERO, DVec2::ZERO);
+        let is_off = |outcome: &Outcome<L>| outcome.found.estimate.outline.is_some_and(is_one_sided);
+        let off: Vec<usize> = (0..second.len()).filter(|&i| is_off(&second[i])).collect();
+        if off.is_empty() {
+            return Ok(second);
+        }
+        let (numbers, wrong): (Vec<_>, Vec<_>) = off.iter().map(|&i| (numbers[i], &second[i])).unzip();
+        let third = self.cut_anew(&numbers, &wrong, pass)?;
+        off.into_iter().zip(third).for_each(|(i, third)| second[i] = third);
+        Ok(second)
+    }
+
+    /// Cut out anew by the model's view from where searches ended, and searched for from there.
+    fn cut_anew<L, O: Borrow<Outcome<L>>>(
+        &self,
+        numbers: &[usize],
+        before: &[O],
+        pass: Pass<L, E>,
+    ) -> Result<Vec<Outcome<L>>, E> {
+        let mut shots = Vec::new();
+        for (&number, before) in numbers.iter().zip(before) {
+            let Outcome { shot, found, .. } = before.borrow();
             let object = FoundObject::of(shot, &found.world_from_camera, self.engine, self.model, 1)?;
             let cut = (self.open)(number, Known { colours: &[], place: Some(&|at| object.shows(at)) });
             // Or nothing, where the pose is far off.
-            anew.push(cut.unwrap_or_else(|_| shot.clone()));
+            shots.push(cut.unwrap_or_else(|_| shot.clone()));
         }
-        let near: Vec<_> = first.iter().map(|outcome| neighbor4(&outcome.found.world_from_camera)).collect();
-        let mut second = pass(numbers, anew, &near)?;
-        second.iter_mut().zip(first).for_each(|(second, first)| second.found.seconds += first.found.seconds);
-        Ok(second)
+        let found = || before.iter().map(|before| &before.borrow().found);
+        let near: Vec<_> = found().map(|found| neighbor4(&found.world_from_camera)).collect();
+        let mut outcomes = pass(numbers, shots, &near)?;
+        outcomes.iter_mut().zip(found()).for_each(|(outcome, before)| outcome.found.seconds += before.seconds);
+        Ok(outcomes)
     }
 
     /// Those of the model's object, from all around.

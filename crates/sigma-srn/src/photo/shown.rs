@@ -81,22 +81,37 @@ impl FoundObject {
 /// Where a view shows the object.
 pub(super) struct Silhouette {
     side: usize,
-    /// How far from white each pixel is.
-    darkness: Vec<f32>,
-    /// Half as dark as the object is, by its median: between object and background pixels are of both.
-    limit: f32,
+    /// How far from white each pixel is, of the farthest beside it: an object has pale parts and dark ones, and each ends where half of its own is left.
+    share: Vec<f32>,
     /// White that no way leads to from the edge: print on the object, or what is seen through it.
     enclosed: Vec<bool>,
 }
 
+/// Between object and background pixels are of both.
+const HALF: f32 = 0.5;
+/// What is no farther from white than this (channels span 2) is background that a network does not show quite white.
+const FAINT: f32 = 0.2;
+
 impl Silhouette {
     pub(super) fn of(rgb: &[f32], side: usize) -> Self {
         let far = |pixel: &[f32]| pixel.iter().map(|c| 1.0 - c.clamp(-1.0, 1.0)).fold(0.0, f32::max);
-        let darkness: Vec<f32> = rgb.chunks_exact(3).map(far).collect();
-        let mut object: Vec<f32> = darkness.iter().copied().filter(|&d| d > 0.2).collect();
-        object.sort_by(f32::total_cmp);
-        let limit = object.get(object.len() / 2).map_or(f32::INFINITY, |median| 0.5 * median);
-        Silhouette { side, darkness, limit, enclosed: vec![] }.filled()
+        let far: Vec<f32> = rgb.chunks_exact(3).map(far).collect();
+        let beside = |at: usize| at.saturating_sub(1)..(at + 2).min(side);
+        let farthest =
+            |[x, y]: [usize; 2]| beside(y).flat_map(|y| &far[y * side..][beside(x)]).copied().fold(2.0 * FAINT, f32::max);
+        let mut share: Vec<f32> = far.iter().enumerate().map(|(i, own)| own / farthest([i % side, i / side])).collect();
+        // Where a dark part goes over into a pale one the object does not end.
+        let inner = (1..side.saturating_sub(1)).flat_map(|y| (1..side - 1).map(move |x| y * side + x));
+        let is_between = |&i: &usize| {
+            let is_on = |step: usize| {
+                let [before, after] = [i - step, i + step];
+                share[before].min(share[after]) > HALF && far[i] > HALF * far[before].min(far[after])
+            };
+            [1, side - 1, side, side + 1].into_iter().any(is_on)
+        };
+        let between: Vec<usize> = inner.filter(is_between).collect();
+        between.into_iter().for_each(|i| share[i] = 1.0);
+        Silhouette { side, share, enclosed: vec![] }.filled()
     }
 
     /// What is enclosed counts as object.
@@ -105,7 +120,7 @@ impl Silhouette {
         let mut reached = vec![false; n * n];
         let mut next: Vec<usize> = (0..n).flat_map(|i| [i, n * (n - 1) + i, n * i, n * i + n - 1]).collect();
         while let Some(pixel) = next.pop() {
-            if self.darkness[pixel] > self.limit || std::mem::replace(&mut reached[pixel], true) {
+            if self.share[pixel] > HALF || std::mem::replace(&mut reached[pixel], true) {
                 continue;
             }
             let (x, y) = (pixel % n, pixel / n);
@@ -113,16 +128,15 @@ impl Silhouette {
             let above = [(y > 0).then(|| pixel - n), (y + 1 < n).then_some(pixel + n)];
             next.extend(around.into_iter().chain(above).flatten());
         }
-        let limit = self.limit;
-        self.enclosed = self.darkness.iter().zip(reached).map(|(darkness, reached)| !reached && *darkness <= limit).collect();
-        let enclosed = self.darkness.iter_mut().zip(&self.enclosed).filter(|(_, is_enclosed)| **is_enclosed);
-        enclosed.for_each(|(darkness, _)| *darkness = 2.0 * limit);
+        self.enclosed = self.share.iter().zip(reached).map(|(share, reached)| !reached && *share <= HALF).collect();
+        let enclosed = self.share.iter_mut().zip(&self.enclosed).filter(|(_, is_enclosed)| **is_enclosed);
+        enclosed.for_each(|(share, _)| *share = 1.0);
         self
     }
 
     /// First and last place that the object covers, 0 to 1 across and down.
     fn bounds(&self) -> Option<[[f64; 2]; 2]> {
-        let covered = self.darkness.iter().enumerate().filter(|(_, darkness)| **darkness > self.limit);
+        let covered = self.share.iter().enumerate().filter(|(_, share)| **share > HALF);
         let cells = covered.map(|(i, _)| [i % self.side, i / self.side]);
         let around = |bounds: Option<[[usize; 2]; 2]>, cell: [usize; 2]| {
             let [low, high] = bounds.unwrap_or([cell; 2]);
@@ -134,7 +148,7 @@ impl Silhouette {
 
     /// Whether a pixel shows the object, and not white within it.
     pub(super) fn is_object(&self, pixel: usize) -> bool {
-        self.darkness[pixel] > self.limit && !self.enclosed[pixel]
+        self.share[pixel] > HALF && !self.enclosed[pixel]
     }
 
     fn is_enclosed(&self, at: [f64; 2]) -> bool {
@@ -152,8 +166,8 @@ impl Silhouette {
         let [x, y] = at.map(|x| (x * self.side as f64 - 0.5).clamp(0.0, last as f64));
         let ([x0, y0], [fx, fy]) = ([x as usize, y as usize], [x.fract() as f32, y.fract() as f32]);
         let [x1, y1] = [x0, y0].map(|i| (i + 1).min(last));
-        let row = |y: usize| (1.0 - fx) * self.darkness[y * self.side + x0] + fx * self.darkness[y * self.side + x1];
-        (1.0 - fy) * row(y0) + fy * row(y1) > self.limit
+        let row = |y: usize| (1.0 - fx) * self.share[y * self.side + x0] + fx * self.share[y * self.side + x1];
+        (1.0 - fy) * row(y0) + fy * row(y1) > HALF
     }
 }
 
@@ -168,6 +182,13 @@ mod tests {
         let silhouette = Silhouette::of(&rgb, 8);
         assert!(!silhouette.covers([0.49, 0.3]) && silhouette.covers([0.51, 0.3]));
         assert!(!silhouette.covers([1.2, 0.3]) && !silhouette.covers([0.9, -0.1]));
+        // Black, and a pale part beside it that is much less dark: it ends where half of its own is left.
+        let rgb: Vec<f32> = (0..64).flat_map(|i| [[-1.0, -1.0, 0.2, 0.5, 0.5, 0.8, 1.0, 1.0][i % 8]; 3]).collect();
+        let silhouette = Silhouette::of(&rgb, 8);
+        let covered: Vec<bool> = (0..8).map(|x| silhouette.covers([(x as f64 + 0.5) / 8.0, 0.3])).collect();
+        assert_eq!(covered, [true, true, true, true, true, false, false, false]);
+        // What is so faint is none of it.
+        assert_eq!(Silhouette::of(&rgb.iter().map(|c| 0.92 + 0.08 * c).collect::<Vec<_>>(), 8).bounds(), None);
         // White that is enclosed belongs to the object.
         let ring = |i: usize| (2..=5).contains(&(i % 8)) && (2..=5).contains(&(i / 8));
         let hole = |i: usize| (3..=4).contains(&(i % 8)) && (3..=4).contains(&(i / 8));
