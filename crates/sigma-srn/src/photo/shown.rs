@@ -81,7 +81,7 @@ impl FoundObject {
 /// Where a view shows the object.
 pub(super) struct Silhouette {
     side: usize,
-    /// How far from white each pixel is, of the farthest beside it, or of most of the object: an object has pale parts and dark ones, and each ends where half of its own is left.
+    /// How far from white each pixel is, of the farthest beside it: an object has pale parts and dark ones, and each ends where half of its own is left.
     share: Vec<f32>,
     /// White that no way leads to from the edge: print on the object, or what is seen through it.
     enclosed: Vec<bool>,
@@ -94,7 +94,9 @@ const FAINT: f32 = 0.2;
 
 impl Silhouette {
     pub(super) fn of(rgb: &[f32], side: usize) -> Self {
-        let far = from_white(rgb);
+        // How far each pixel is from white.
+        let far = |pixel: &[f32]| pixel.iter().map(|c| 1.0 - c.clamp(-1.0, 1.0)).fold(0.0, f32::max);
+        let far: Vec<f32> = rgb.chunks_exact(3).map(far).collect();
         let beside = |at: usize| at.saturating_sub(1)..(at + 2).min(side);
         let farthest =
             |[x, y]: [usize; 2]| beside(y).flat_map(|y| &far[y * side..][beside(x)]).copied().fold(2.0 * FAINT, f32::max);
@@ -111,15 +113,6 @@ impl Silhouette {
         let between: Vec<usize> = inner.filter(is_between).collect();
         between.into_iter().for_each(|i| share[i] = 1.0);
         Silhouette { side, share, enclosed: vec![] }.filled()
-    }
-
-    /// Without what is much paler than most of it, which tells little in few cells.
-    pub(super) fn of_most(rgb: &[f32], side: usize) -> Self {
-        let far = from_white(rgb);
-        let mut object: Vec<f32> = far.iter().copied().filter(|&far| far > FAINT).collect();
-        object.sort_by(f32::total_cmp);
-        let median = object.get(object.len() / 2).map_or(f32::INFINITY, |median| *median);
-        Silhouette { side, share: far.into_iter().map(|far| far / median).collect(), enclosed: vec![] }.filled()
     }
 
     /// What is enclosed counts as object.
@@ -177,11 +170,6 @@ impl Silhouette {
         let row = |y: usize| (1.0 - fx) * self.share[y * self.side + x0] + fx * self.share[y * self.side + x1];
         (1.0 - fy) * row(y0) + fy * row(y1) > HALF
     }
-}
-
-/// How far each pixel is from white.
-fn from_white(rgb: &[f32]) -> Vec<f32> {
-    rgb.chunks_exact(3).map(|pixel| pixel.iter().map(|c| 1.0 - c.clamp(-1.0, 1.0)).fold(0.0, f32::max)).collect()
 }
 
 #[cfg(test)]

@@ -121,11 +121,11 @@ impl<'a> Sightings<'a> {
     pub fn rival(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<Option<Sighting>, Error> {
         let seen_from = |pose: &DMat4| FoundObject::of(shot, pose, self.engine, self.model, 1);
         let Some(bounds) = seen_from(world_from_camera)?.bounds() else { return Ok(None) };
-        let (mut most, mut best) = (self.evidence(shot, world_from_camera)?, None);
+        let (mut most, mut best) = (self.evidence_nearby(shot, world_from_camera)?, None);
         for (axis, degrees) in [DVec3::X, DVec3::Y].into_iter().flat_map(|axis| [(axis, TILT_DEG), (axis, -TILT_DEG)]) {
             let tilt = DMat4::from_axis_angle(world_from_camera.transform_vector3(axis), degrees.to_radians());
             let side = tilt * *world_from_camera;
-            let evidence = self.evidence(shot, &side)?;
+            let evidence = self.evidence_nearby(shot, &side)?;
             if evidence > most
                 && let object = seen_from(&side)?
                 && let Some(bounds) = object.bounds()
@@ -147,6 +147,19 @@ impl<'a> Sightings<'a> {
 
     /// How much speaks for a pose that was found in a part of the photograph.
     pub fn evidence(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<f32, Error> {
+        let (at, template) = self.placed(shot, world_from_camera)?;
+        Ok(self.looked.judged(at, &template).evidence)
+    }
+
+    /// As [`Self::evidence`], with the object moved a little, as sightings are.
+    fn evidence_nearby(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<f32, Error> {
+        let (at, template) = self.placed(shot, world_from_camera)?;
+        let nearby = |at: Match, step: f32| self.looked.nearby(at, &template, step);
+        Ok(nearby(nearby(at, 0.03), 0.015).evidence)
+    }
+
+    /// What a pose shows in the photograph, and where.
+    fn placed(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<(Match, Template), Error> {
         let Intrinsics { fx, fy, cx, cy, pixel_center } = shot.intrinsics;
         let object = world_from_camera.inverse().transform_point3(DVec3::ZERO);
         // Edges of pixels are whole numbers.
@@ -161,7 +174,7 @@ impl<'a> Sightings<'a> {
         let middle = [0, 1].map(|k| (self.finer * (corner[k] as f64 + pixels * middle[k])) as f32);
         let diagonal = (self.finer * pixels * diagonal) as f32;
         let at = Match { middle, diagonal, template: 0, roll: 0.0, evidence: 0.0 };
-        Ok(self.looked.judged(at, &Template::of(&view.rgb)).evidence)
+        Ok((at, Template::of(&view.rgb)))
     }
 
     /// `None` where the model shows nothing.
@@ -211,21 +224,23 @@ impl Looked {
         let first: Vec<Match> = sizes.flat_map(|size| matrices.everywhere(&self.levels[0], size)).collect();
         let half = |found: &Match| &templates[found.template][1];
         let first = best(first.into_par_iter().map(|found| self.judged(found, half(&found))).collect(), BEST);
-        let by = |found: Match, template: &Template, step: f32| {
-            let tried = found.nearby(step).map(|found| self.judged(found, template));
-            tried.max_by(|a, b| a.evidence.total_cmp(&b.evidence)).unwrap_or(found)
-        };
-        let better = first.into_par_iter().map(|found| by(found, half(&found), 0.06)).collect();
+        let better = first.into_par_iter().map(|found| self.nearby(found, half(&found), 0.06)).collect();
         let finer = |found: Vec<Match>, step: f32, turn: f32| {
             let turned = |found: Match, turn: f32| {
                 let found = Match { roll: found.roll + turn, ..found };
-                by(found, &views[found.template / ROLLS].rolled(found.roll), step)
+                self.nearby(found, &views[found.template / ROLLS].rolled(found.roll), step)
             };
             let of = |found: Match| [turned(found, -turn), turned(found, turn)].into_iter().fold(turned(found, 0.0), Match::or);
             found.into_par_iter().map(of).collect()
         };
         let finest = finer(best(better, BETTER), 0.03, ROLL / 3.0);
         best(finer(finest, 0.015, ROLL / 6.0), BETTER)
+    }
+
+    /// The likeliest of what is there, moved by a part of the diagonal, and so much larger and smaller.
+    fn nearby(&self, found: Match, template: &Template, step: f32) -> Match {
+        let tried = found.nearby(step).map(|found| self.judged(found, template));
+        tried.max_by(|a, b| a.evidence.total_cmp(&b.evidence)).unwrap_or(found)
     }
 
     /// With what speaks for it, by this template.

@@ -43,7 +43,7 @@ pub(super) struct Template {
 impl Template {
     /// Of a view of [`SIDE`] pixels, colours in [-1, 1]; without an object, if it shows none.
     pub fn of(rgb: &[f32]) -> Self {
-        let silhouette = Silhouette::of_most(rgb, SIDE);
+        let silhouette = Silhouette::of(rgb, SIDE);
         let is_object: Vec<bool> = (0..SIDE * SIDE).map(|i| silhouette.is_object(i)).collect();
         let object = |i: usize| if is_object[i] { colour(&rgb[3 * i..]).extend(1.0) } else { Vec4::ZERO };
         let object: Vec<Vec4> = (0..SIDE * SIDE).map(object).collect();
