@@ -52,18 +52,19 @@ fn an_object_is_found_anywhere() {
     let (engine, search, instance) = (Engine::cpu(), Search::of(Effort::Fast), model.instance("forklift").unwrap());
     let photo = scene();
     let sightings = Sightings::of(&engine, &model, instance, &photo).unwrap();
-    let first = &sightings.likeliest(1)[0];
+    let first = sightings.likeliest(1).remove(0);
     assert!(first.bounds.overlap(&FORKLIFT) > 0.5, "{:?}", first.bounds);
     let starts = |shot: &Shot| shot.around(&model, camera::around2016, None);
     let (shot, found) = search.run_anywhere(&engine, &model, instance, (&photo, &INTRINSICS), starts, |_| Ok(())).unwrap();
     let (angle, distance) = camera::pose_error(&found.world_from_camera, &truth);
     assert!(angle < 0.6 && distance < 0.015 && found.is_trusted(), "{angle} {distance} {:?}", found.doubt);
     // Less speaks for wrong poses, and something else for a better one: next to it, or all around the object from it.
+    let sides = sightings.sides(first).unwrap();
     let evidence = |pose: &glam::DMat4| sightings.evidence(&shot, pose).unwrap();
     for degrees in [12.0f64, -70.0, 180.0] {
         let wrong = glam::DMat4::from_rotation_z(degrees.to_radians()) * truth;
         assert!(evidence(&wrong) < 0.97 * evidence(&truth), "{degrees}: {} of {}", evidence(&wrong), evidence(&truth));
-        let rival = sightings.rival(&shot, &wrong).unwrap().unwrap();
+        let rival = sightings.rivals(&shot, &wrong, &sides).unwrap().remove(0);
         let [before, after] = [&wrong, &rival.side].map(|side| {
             let facing = |pose| shot.facing(&model, pose).unwrap();
             camera::pose_error(&facing(side), &facing(&truth)).0

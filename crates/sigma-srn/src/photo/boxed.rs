@@ -150,6 +150,9 @@ pub struct Anywhere<'a, E> {
     pub places: usize,
 }
 
+/// So many sides from which it looks more like the object than it does as it was found are tried at a place.
+const RIVALS: usize = 3;
+
 /// At so many places where it seems to be an object is found that is found at all.
 pub const PLACES: usize = 5;
 
@@ -159,24 +162,25 @@ impl<E: From<Error>> Anywhere<'_, E> {
     pub fn search<L>(&self, sightings: &Sightings, pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
         let mut outcomes = Vec::new();
         for sighting in sightings.likeliest(self.places) {
-            let Some((bounds, outcome)) = self.around(&sighting, self.starts, &mut *pass)? else { continue };
-            let outcome = self.or_rival(sightings, outcome, &mut *pass)?;
+            let sides = sightings.sides(sighting)?;
+            let Some((bounds, outcome)) = self.around(&sides[0], self.starts, &mut *pass)? else { continue };
+            let outcome = self.or_rival(sightings, &sides, outcome, &mut *pass)?;
             let is_found = outcome.found.is_trusted();
-            outcomes.push((bounds, outcome));
+            outcomes.push((bounds, sides, outcome));
             if is_found {
                 break;
             }
         }
-        let mut seconds: f64 = outcomes.iter().map(|(_, outcome)| outcome.found.seconds).sum();
-        if let Some((_, Outcome { shot, found, log })) = outcomes.pop_if(|(_, outcome)| outcome.found.is_trusted()) {
+        let mut seconds: f64 = outcomes.iter().map(|(.., outcome)| outcome.found.seconds).sum();
+        if let Some((.., Outcome { shot, found, log })) = outcomes.pop_if(|(.., outcome)| outcome.found.is_trusted()) {
             return Ok(Some(Outcome { shot, found: Found { seconds, ..found }, log }));
         }
-        outcomes.sort_by(|(_, a), (_, b)| a.found.unexplained.total_cmp(&b.found.unexplained));
+        outcomes.sort_by(|(.., a), (.., b)| a.found.unexplained.total_cmp(&b.found.unexplained));
         let mut best = None::<Outcome<L>>;
-        for (bounds, outcome) in outcomes.into_iter().take(AGAIN) {
+        for (bounds, sides, outcome) in outcomes.into_iter().take(AGAIN) {
             seconds -= outcome.found.seconds;
             for outcome in self.at(bounds, |boxed| boxed.by_colours(&[0], vec![outcome], &mut *pass))? {
-                let outcome = self.or_rival(sightings, outcome, &mut *pass)?;
+                let outcome = self.or_rival(sightings, &sides, outcome, &mut *pass)?;
                 let Outcome { found, .. } = &outcome;
                 seconds += found.seconds;
                 if found.is_trusted() || best.as_ref().is_none_or(|best| found.unexplained < best.found.unexplained) {
@@ -191,20 +195,27 @@ impl<E: From<Error>> Anywhere<'_, E> {
         Ok(best)
     }
 
-    /// If it is trusted, what looks like the object from another side, too, is searched for from there; what of both has more in the photograph that speaks for it counts.
-    fn or_rival<L>(&self, sightings: &Sightings, outcome: Outcome<L>, pass: Pass<L, E>) -> Result<Outcome<L>, E> {
-        let Outcome { shot, found, .. } = &outcome;
-        if !found.is_trusted() {
+    /// If it is trusted, what looks more like the object from other sides is searched for from there, until one has more in the photograph that speaks for it, which counts.
+    fn or_rival<L>(
+        &self,
+        sightings: &Sightings,
+        sides: &[Sighting],
+        outcome: Outcome<L>,
+        pass: Pass<L, E>,
+    ) -> Result<Outcome<L>, E> {
+        if !outcome.found.is_trusted() {
             return Ok(outcome);
         }
-        let Some(rival) = sightings.rival(shot, &found.world_from_camera)? else { return Ok(outcome) };
-        let near = |shot: &Shot| Ok(neighbor4(&shot.facing(self.model, &rival.side)?));
-        let Some((_, mut other)) = self.around(&rival, &near, pass)? else { return Ok(outcome) };
         let evidence = |Outcome { shot, found, .. }: &Outcome<L>| sightings.evidence(shot, &found.world_from_camera);
-        let (seconds, is_more) = (found.seconds + other.found.seconds, evidence(&other)? > evidence(&outcome)?);
-        if is_more {
-            other.found.seconds = seconds;
-            return Ok(other);
+        let (least, mut seconds) = (evidence(&outcome)?, outcome.found.seconds);
+        for rival in sightings.rivals(&outcome.shot, &outcome.found.world_from_camera, sides)?.into_iter().take(RIVALS) {
+            let near = |shot: &Shot| Ok(neighbor4(&shot.facing(self.model, &rival.side)?));
+            let Some((_, mut other)) = self.around(&rival, &near, &mut *pass)? else { continue };
+            seconds += other.found.seconds;
+            if evidence(&other)? > least {
+                other.found.seconds = seconds;
+                return Ok(other);
+            }
         }
         Ok(Outcome { found: Found { seconds, ..outcome.found }, ..outcome })
     }

@@ -116,11 +116,7 @@ impl Shot {
     /// The camera that sees the side of the object that `world_from_camera` sees, in the middle of the square and as far away as its size says.
     pub fn facing(&self, model: &Model, world_from_camera: &DMat4) -> Result<DMat4, Error> {
         let radius = self.radius(model, None)?;
-        let object = world_from_camera.inverse().transform_point3(DVec3::ZERO);
-        let towards = *world_from_camera * DMat4::from_quat(DQuat::from_rotation_arc(DVec3::Z, object.normalize_or(DVec3::Z)));
-        let [right, down, forward] = [towards.x_axis, towards.y_axis, towards.z_axis];
-        let camera = DMat4::from_cols(right, down, forward, (-radius * forward.truncate()).extend(1.0));
-        Ok(self.intrinsics.centred([self.side; 2], vec![camera]).remove(0))
+        Ok(self.intrinsics.centred([self.side; 2], vec![towards(world_from_camera, radius)]).remove(0))
     }
 
     fn radius(&self, model: &Model, given: Option<f64>) -> Result<f64, Error> {
@@ -129,6 +125,14 @@ impl Shot {
             what: "the model does not say how far its cameras were: it must be given".into(),
         })
     }
+}
+
+/// The camera that sees the same side of the object in the middle of its picture, so far away.
+fn towards(world_from_camera: &DMat4, radius: f64) -> DMat4 {
+    let object = world_from_camera.inverse().transform_point3(DVec3::ZERO);
+    let towards = *world_from_camera * DMat4::from_quat(DQuat::from_rotation_arc(DVec3::Z, object.normalize_or(DVec3::Z)));
+    let [right, down, forward] = [towards.x_axis, towards.y_axis, towards.z_axis];
+    DMat4::from_cols(right, down, forward, (-radius * forward.truncate()).extend(1.0))
 }
 
 impl Search {

@@ -11,6 +11,7 @@ use crate::{Engine, Error, Intrinsics, Model};
 const WIDER: usize = 2;
 
 /// Where the model shows an object in the photograph.
+#[derive(Clone)]
 pub struct FoundObject {
     silhouette: Silhouette,
     square: ([i64; 2], usize),
@@ -79,6 +80,7 @@ impl FoundObject {
 }
 
 /// Where a view shows the object.
+#[derive(Clone)]
 pub(super) struct Silhouette {
     side: usize,
     /// How far from white each pixel is, of the farthest beside it: an object has pale parts and dark ones, and each ends where half of its own is left.

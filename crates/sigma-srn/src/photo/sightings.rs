@@ -10,7 +10,7 @@ use srn_photo::{Photo, Pixels};
 use srn_shaders::LinearParams;
 
 use super::template::{Cell, ROLL, ROLLS, SIDE, Template, WIDER, coarse, rolled_view};
-use super::{BoundingBox, FoundObject, Shot};
+use super::{BoundingBox, FoundObject, Shot, towards};
 use crate::camera::{around2016, pose_error};
 use crate::renderer::render_views;
 use crate::{Engine, Error, Intrinsics, Model, View};
@@ -42,9 +42,17 @@ const BETTER: usize = 200;
 const AT_PLACE: usize = 3;
 /// Two that have more than this part of both boxes in common are one.
 const SAME: f64 = 0.4;
-/// Degrees between sides that are not the same, and by which those next to a side are turned.
+/// Degrees between sides that are not the same.
 const ELSEWHERE_DEG: f64 = 30.0;
-const TILT_DEG: f64 = 12.0;
+/// So many sides are tried at a place; what speaks for them is at least so much of what does for the likeliest.
+const SIDES: usize = 6;
+const NEARLY: f32 = 0.9;
+/// By so many degrees a side is turned, at first and at last, and at most so often.
+const TURN_DEG: f64 = 12.0;
+const LEAST_TURN_DEG: f64 = 6.0;
+const TURNS: usize = 12;
+/// By this part of its diagonal an object is moved that is looked at from another side.
+const MOVED: f32 = 0.03;
 
 /// A photograph as it was looked at for an object, and where that may be.
 pub struct Sightings<'a> {
@@ -62,6 +70,7 @@ pub struct Sightings<'a> {
 }
 
 /// Where in a photograph the object may be.
+#[derive(Clone)]
 pub struct Sighting {
     /// What it would cover.
     pub object: FoundObject,
@@ -69,6 +78,7 @@ pub struct Sighting {
     pub bounds: BoundingBox,
     /// A `world_from_camera` that sees it from the same side, in the middle of its picture.
     pub side: DMat4,
+    found: Match,
 }
 
 /// Where a template fits.
@@ -89,18 +99,15 @@ impl<'a> Sightings<'a> {
     /// Of an instance of `model`. It is found where its diagonal is an eleventh or more of the photograph's longer side.
     pub fn of(engine: &'a Engine, model: &'a Model, instance: u32, photo: &Photo) -> Result<Self, Error> {
         let radius = model.metadata.orbit_radius.unwrap_or(1.3);
-        let (focal, middle) = (SIDE as f64 * radius / WIDER, 0.5 * SIDE as f64);
-        let camera = Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.5 };
         let cameras: Vec<DMat4> = around2016(radius).into_iter().step_by(ROLLS).collect();
-        let views: Vec<View> = cameras.iter().map(|pose| (instance, *pose, camera)).collect();
-        let views = render_views(engine, model, [SIDE as u32; 2], &views)?;
-        let views: Vec<Vec<f32>> = views.into_iter().map(|view| view.rgb).collect();
         let size = photo.size().map(|pixels| pixels as f64);
         let finer = (FINEST / size[0].max(size[1])).min(1.0);
         let [width, height] = size.map(|pixels| (finer * pixels).round().max(1.0) as usize);
         let looked = Looked::at(photo.pixels().area_resample(width, height));
-        let matches = looked.matches(&views);
-        Ok(Sightings { engine, model, instance, looked, finer, views, cameras, matches })
+        let nothing = Sightings { engine, model, instance, looked, finer, views: vec![], cameras, matches: vec![] };
+        let views = nothing.views_from(&nothing.cameras)?;
+        let matches = nothing.looked.matches(&views);
+        Ok(Sightings { views, matches, ..nothing })
     }
 
     /// The likeliest places, the likeliest first, at most so many.
@@ -117,75 +124,127 @@ impl<'a> Sightings<'a> {
         likeliest
     }
 
-    /// What looks more like the object than it does from a pose that was found in a part of the photograph: the same turned a little, or what was sighted there from another side.
-    pub fn rival(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<Option<Sighting>, Error> {
-        let seen_from = |pose: &DMat4| FoundObject::of(shot, pose, self.engine, self.model, 1);
-        let Some(bounds) = seen_from(world_from_camera)?.bounds() else { return Ok(None) };
-        let (mut most, mut best) = (self.evidence_nearby(shot, world_from_camera)?, None);
-        for (axis, degrees) in [DVec3::X, DVec3::Y].into_iter().flat_map(|axis| [(axis, TILT_DEG), (axis, -TILT_DEG)]) {
-            let tilt = DMat4::from_axis_angle(world_from_camera.transform_vector3(axis), degrees.to_radians());
-            let side = tilt * *world_from_camera;
-            let evidence = self.evidence_nearby(shot, &side)?;
-            if evidence > most
-                && let object = seen_from(&side)?
-                && let Some(bounds) = object.bounds()
+    /// From which sides the object may be seen at a place, each turned for as long as more speaks for it; the likeliest first, and at least the one that was sighted.
+    pub fn sides(&self, place: Sighting) -> Result<Vec<Sighting>, Error> {
+        let least = NEARLY * place.found.evidence;
+        let mut sides = vec![place];
+        for found in self.matches.iter().take_while(|found| found.evidence > least) {
+            if sides.len() < SIDES
+                && let Some(sighting) = self.sighting(found)
+                && sighting.bounds.overlap(&sides[0].bounds) >= SAME
+                && sides.iter().all(|other| sighting.is_elsewhere(other))
             {
-                (most, best) = (evidence, Some(Sighting { object, bounds, side }));
+                sides.push(sighting);
             }
         }
-        let facing = shot.facing(self.model, world_from_camera)?;
-        for found in self.matches.iter().take_while(|found| found.evidence > most) {
-            if let Some(sighting) = self.sighting(found)
-                && sighting.bounds.overlap(&bounds) >= SAME
-                && pose_error(&facing, &shot.facing(self.model, &sighting.side)?).0 > ELSEWHERE_DEG
-            {
-                return Ok(Some(sighting));
+        let sides = sides.into_iter().map(|side| self.turned(side)).collect::<Result<_, _>>()?;
+        Ok(likeliest_first(sides))
+    }
+
+    /// What looks more like the object than it does from a pose that was found in a part of the photograph, the likeliest first: the same turned, or another of the sides that were sighted there.
+    pub fn rivals(&self, shot: &Shot, world_from_camera: &DMat4, sides: &[Sighting]) -> Result<Vec<Sighting>, Error> {
+        // What is judged anew may have moved a little, and is seen from as far away as it is.
+        let focal = self.finer * shot.pixels_of_photo() * shot.intrinsics.fx;
+        let anew = |at: Match, side: &DMat4| -> Result<Option<Sighting>, Error> {
+            let side = towards(side, focal / f64::from(at.diagonal));
+            let view = self.views_from(&[side])?.remove(0);
+            let at = self.looked.settled(at, &Template::of(&view));
+            Ok(self.seen(at, &view, side))
+        };
+        let Some(found) = anew(self.place(shot, world_from_camera), world_from_camera)? else { return Ok(vec![]) };
+        let mut rivals: Vec<Sighting> = self.next_to(&found, TURN_DEG)?.into_iter().collect();
+        for side in sides.iter().filter(|side| side.is_elsewhere(&found)) {
+            rivals.extend(anew(side.found, &side.side)?);
+        }
+        rivals.retain(|rival| rival.found.evidence > found.found.evidence);
+        Ok(likeliest_first(rivals))
+    }
+
+    /// Turned for as long as more speaks for it, in smaller steps at last.
+    fn turned(&self, sighting: Sighting) -> Result<Sighting, Error> {
+        let (mut best, mut degrees) = (sighting, TURN_DEG);
+        for _ in 0..TURNS {
+            match self.next_to(&best, degrees)? {
+                Some(likelier) => best = likelier,
+                None if degrees > LEAST_TURN_DEG => degrees = LEAST_TURN_DEG,
+                None => break,
             }
         }
         Ok(best)
     }
 
+    /// What looks more like the object of the same turned by so many degrees about the object's middle.
+    fn next_to(&self, sighting: &Sighting, degrees: f64) -> Result<Option<Sighting>, Error> {
+        let turns = [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]);
+        let turned = |axis| DMat4::from_axis_angle(sighting.side.transform_vector3(axis), degrees.to_radians()) * sighting.side;
+        let cameras: Vec<DMat4> = turns.map(turned).collect();
+        let views = self.views_from(&cameras)?;
+        let judged =
+            zip(&views, cameras).map(|(view, side)| (self.looked.settled(sighting.found, &Template::of(view)), view, side));
+        let likeliest = judged.max_by(|(a, ..), (b, ..)| a.evidence.total_cmp(&b.evidence));
+        let likelier = likeliest.filter(|(found, ..)| found.evidence > sighting.found.evidence);
+        Ok(likelier.and_then(|(found, view, side)| self.seen(found, view, side)))
+    }
+
+    /// What the model shows from cameras that have it in the middle, as templates are made of it.
+    fn views_from(&self, cameras: &[DMat4]) -> Result<Vec<Vec<f32>>, Error> {
+        let view = |camera: &DMat4| {
+            let (focal, middle) = (SIDE as f64 * camera.w_axis.truncate().length() / WIDER, 0.5 * SIDE as f64);
+            let intrinsics = Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.5 };
+            (self.instance, *camera, intrinsics)
+        };
+        let views: Vec<View> = cameras.iter().map(view).collect();
+        let views = render_views(self.engine, self.model, [SIDE as u32; 2], &views)?;
+        Ok(views.into_iter().map(|view| view.rgb).collect())
+    }
+
     /// How much speaks for a pose that was found in a part of the photograph.
     pub fn evidence(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<f32, Error> {
-        let (at, template) = self.placed(shot, world_from_camera)?;
-        Ok(self.looked.judged(at, &template).evidence)
+        let at = self.place(shot, world_from_camera);
+        let view = self.views_from(&[towards(world_from_camera, world_from_camera.w_axis.truncate().length())])?.remove(0);
+        Ok(self.looked.judged(at, &Template::of(&view)).evidence)
     }
 
-    /// As [`Self::evidence`], with the object moved a little, as sightings are.
-    fn evidence_nearby(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<f32, Error> {
-        let (at, template) = self.placed(shot, world_from_camera)?;
-        let nearby = |at: Match, step: f32| self.looked.nearby(at, &template, step);
-        Ok(nearby(nearby(at, 0.03), 0.015).evidence)
-    }
-
-    /// What a pose shows in the photograph, and where.
-    fn placed(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<(Match, Template), Error> {
+    /// Where in the photograph such a pose shows the object.
+    fn place(&self, shot: &Shot, world_from_camera: &DMat4) -> Match {
         let Intrinsics { fx, fy, cx, cy, pixel_center } = shot.intrinsics;
         let object = world_from_camera.inverse().transform_point3(DVec3::ZERO);
         // Edges of pixels are whole numbers.
-        let [cx, cy] = [cx, cy].map(|c| c - pixel_center + 0.5);
-        let middle = [fx * object.x / object.z + cx, fy * object.y / object.z + cy];
-        let diagonal = fx / object.length();
-        let (wide, cells) = (WIDER * diagonal, SIDE as f64);
-        let [cx, cy] = [[cx, middle[0]], [cy, middle[1]]].map(|[c, middle]| cells * ((c - middle) / wide + 0.5));
-        let camera = Intrinsics { fx: cells * fx / wide, fy: cells * fy / wide, cx, cy, pixel_center: 0.5 };
-        let view = &render_views(self.engine, self.model, [SIDE as u32; 2], &[(self.instance, *world_from_camera, camera)])?[0];
+        let middle = [fx * object.x / object.z + cx, fy * object.y / object.z + cy].map(|c| c - pixel_center + 0.5);
         let (corner, pixels) = (shot.square.0, shot.pixels_of_photo());
         let middle = [0, 1].map(|k| (self.finer * (corner[k] as f64 + pixels * middle[k])) as f32);
-        let diagonal = (self.finer * pixels * diagonal) as f32;
-        let at = Match { middle, diagonal, template: 0, roll: 0.0, evidence: 0.0 };
-        Ok((at, Template::of(&view.rgb)))
+        let diagonal = (self.finer * pixels * fx / object.length()) as f32;
+        Match { middle, diagonal, template: 0, roll: 0.0, evidence: 0.0 }
     }
 
     /// `None` where the model shows nothing.
-    fn sighting(&self, &Match { middle, diagonal, template, roll, .. }: &Match) -> Option<Sighting> {
-        let wide = WIDER * f64::from(diagonal) / self.finer;
-        let corner = middle.map(|at| f64::from(at) / self.finer - 0.5 * wide);
-        let (view, camera) = (template / ROLLS, self.cameras[template / ROLLS]);
-        let object = FoundObject::in_square(&rolled_view(&self.views[view], roll), SIDE, corner, wide);
-        let bounds = object.bounds()?;
-        Some(Sighting { object, bounds, side: camera * DMat4::from_rotation_z(roll.into()) })
+    fn sighting(&self, found: &Match) -> Option<Sighting> {
+        let view = found.template / ROLLS;
+        self.seen(
+            *found,
+            &rolled_view(&self.views[view], found.roll),
+            self.cameras[view] * DMat4::from_rotation_z(found.roll.into()),
+        )
     }
+
+    fn seen(&self, found: Match, view: &[f32], side: DMat4) -> Option<Sighting> {
+        let wide = WIDER * f64::from(found.diagonal) / self.finer;
+        let corner = found.middle.map(|at| f64::from(at) / self.finer - 0.5 * wide);
+        let object = FoundObject::in_square(view, SIDE, corner, wide);
+        let bounds = object.bounds()?;
+        Some(Sighting { object, bounds, side, found })
+    }
+}
+
+impl Sighting {
+    fn is_elsewhere(&self, other: &Self) -> bool {
+        pose_error(&self.side, &other.side).0 > ELSEWHERE_DEG
+    }
+}
+
+fn likeliest_first(mut sightings: Vec<Sighting>) -> Vec<Sighting> {
+    sightings.sort_by(|a, b| b.found.evidence.total_cmp(&a.found.evidence));
+    sightings
 }
 
 /// A picture as it is looked at.
@@ -241,6 +300,20 @@ impl Looked {
     fn nearby(&self, found: Match, template: &Template, step: f32) -> Match {
         let tried = found.nearby(step).map(|found| self.judged(found, template));
         tried.max_by(|a, b| a.evidence.total_cmp(&b.evidence)).unwrap_or(found)
+    }
+
+    /// Moved for as long as more speaks for it, some steps at most.
+    fn settled(&self, found: Match, template: &Template) -> Match {
+        const STEPS: usize = 8;
+        let mut best = self.judged(found, template);
+        for _ in 0..STEPS {
+            let nearby = self.nearby(best, template, MOVED);
+            if nearby.evidence <= best.evidence {
+                break;
+            }
+            best = nearby;
+        }
+        best
     }
 
     /// With what speaks for it, by this template.
