@@ -164,7 +164,9 @@ impl<E: From<Error>> Anywhere<'_, E> {
         for sighting in sightings.likeliest(self.places) {
             let sides = sightings.sides(sighting)?;
             let Some((bounds, outcome)) = self.around(&sides[0], self.starts, &mut *pass)? else { continue };
-            let outcome = self.or_rival(sightings, &sides, outcome, &mut *pass)?;
+            // A mask that has something else in it may lead anywhere, but where it is the likeliest the object mostly is.
+            let is_worth_it = outcomes.is_empty() || outcome.found.is_trusted();
+            let outcome = if is_worth_it { self.or_rival(sightings, &sides, outcome, &mut *pass)? } else { outcome };
             let is_found = outcome.found.is_trusted();
             outcomes.push((bounds, sides, outcome));
             if is_found {
@@ -180,7 +182,8 @@ impl<E: From<Error>> Anywhere<'_, E> {
         for (bounds, sides, outcome) in outcomes.into_iter().take(AGAIN) {
             seconds -= outcome.found.seconds;
             for outcome in self.at(bounds, |boxed| boxed.by_colours(&[0], vec![outcome], &mut *pass))? {
-                let outcome = self.or_rival(sightings, &sides, outcome, &mut *pass)?;
+                let is_found = outcome.found.is_trusted();
+                let outcome = if is_found { self.or_rival(sightings, &sides, outcome, &mut *pass)? } else { outcome };
                 let Outcome { found, .. } = &outcome;
                 seconds += found.seconds;
                 if found.is_trusted() || best.as_ref().is_none_or(|best| found.unexplained < best.found.unexplained) {
@@ -195,7 +198,7 @@ impl<E: From<Error>> Anywhere<'_, E> {
         Ok(best)
     }
 
-    /// If it is trusted, what looks more like the object from other sides is searched for from there, until one has more in the photograph that speaks for it, which counts.
+    /// What looks more like the object from other sides is searched for from there, until one has more in the photograph that speaks for it, which counts.
     fn or_rival<L>(
         &self,
         sightings: &Sightings,
@@ -203,9 +206,6 @@ impl<E: From<Error>> Anywhere<'_, E> {
         outcome: Outcome<L>,
         pass: Pass<L, E>,
     ) -> Result<Outcome<L>, E> {
-        if !outcome.found.is_trusted() {
-            return Ok(outcome);
-        }
         let evidence = |Outcome { shot, found, .. }: &Outcome<L>| sightings.evidence(shot, &found.world_from_camera);
         let (least, mut seconds) = (evidence(&outcome)?, outcome.found.seconds);
         for rival in sightings.rivals(&outcome.shot, &outcome.found.world_from_camera, sides)?.into_iter().take(RIVALS) {
