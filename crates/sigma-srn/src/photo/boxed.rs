@@ -157,8 +157,9 @@ const RIVALS: usize = 3;
 pub const PLACES: usize = 5;
 
 impl<E: From<Error>> Anywhere<'_, E> {
-    /// Searches at each of the places where the object seems to be, the likeliest first, until a pose is to be trusted, and nothing that looks more like the object ([`Sightings::rival`]) leads to a better
-    /// one; if none is, once more by the colours of the model's object where the least is left unexplained, which counts. `None` where no place differs from what is around it.
+    /// Searches at each of the places where the object seems to be, the likeliest first, from the likeliest of the [`Sightings::sides`] there, until a pose is to be trusted, and nothing that looks more like the
+    /// object ([`Sightings::rivals`]) leads to a better one; if none is, once more by the colours of the model's object where the least is left unexplained, which counts. `None` where no place differs from what
+    /// is around it.
     pub fn search<L>(&self, sightings: &Sightings, pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
         let mut outcomes = Vec::new();
         for sighting in sightings.likeliest(self.places) {
