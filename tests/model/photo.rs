@@ -58,17 +58,19 @@ fn an_object_is_found_anywhere() {
     let (shot, found) = search.run_anywhere(&engine, &model, instance, (&photo, &INTRINSICS), starts, |_| Ok(())).unwrap();
     let (angle, distance) = camera::pose_error(&found.world_from_camera, &truth);
     assert!(angle < 0.6 && distance < 0.015 && found.is_trusted(), "{angle} {distance} {:?}", found.doubt);
+    // The side that was sighted is turned towards the right one.
+    let facing = |side: &glam::DMat4| shot.facing(&model, side).unwrap();
+    let off = |side: &glam::DMat4| camera::pose_error(&facing(side), &facing(&truth)).0;
+    let sides = sightings.sides(first.clone()).unwrap();
+    let [sighted, turned] = [&first, &sides[0]].map(|sighting| off(&sighting.side));
+    assert!(turned < 0.9 * sighted, "{sighted} {turned}");
     // Less speaks for wrong poses, and something else for a better one: next to it, or all around the object from it.
-    let sides = sightings.sides(first).unwrap();
     let evidence = |pose: &glam::DMat4| sightings.evidence(&shot, pose).unwrap();
     for degrees in [12.0f64, -70.0, 180.0] {
         let wrong = glam::DMat4::from_rotation_z(degrees.to_radians()) * truth;
         assert!(evidence(&wrong) < 0.97 * evidence(&truth), "{degrees}: {} of {}", evidence(&wrong), evidence(&truth));
         let rival = sightings.rivals(&shot, &wrong, &sides).unwrap().remove(0);
-        let [before, after] = [&wrong, &rival.side].map(|side| {
-            let facing = |pose| shot.facing(&model, pose).unwrap();
-            camera::pose_error(&facing(side), &facing(&truth)).0
-        });
+        let [before, after] = [&wrong, &rival.side].map(off);
         assert!(after < before.min(40.0), "{degrees}: {before} {after}");
     }
     let grey = Photo::from_rgba8(64, 48, &[120, 130, 140, 255].repeat(64 * 48)).unwrap();

@@ -8,7 +8,7 @@ use clap::Args;
 use glam::DMat4;
 use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::photo::{Anywhere, Boxed, Known, Outcome, PLACES, Shot, Sightings};
+use sigma_srn::photo::{Anywhere, Boxed, Known, Outcome, Shot, Sightings};
 use sigma_srn::{Confidence, Doubt, Engine, Error, Found, Light, Model, Pose6, Progress, Search};
 use srn_data::camera::Axes;
 use srn_data::target::photo;
@@ -54,7 +54,7 @@ pub struct Estimate {
     cutout: Vec<PathBuf>,
     /// A box around the object, as detectors give it, instead of a segmentation: left edge, top edge, width and height in pixels of the picture. What in it is the
     /// object is found by its colours, and then by the pose that was found with these, from where the search is done once more. `auto`: it is looked for in all of the
-    /// picture, by how the model shows it from all around, and a pose is searched for at up to five places, until one is to be trusted. Once, or once per picture.
+    /// picture, by how the model shows it from all around, and a pose is searched for at up to two places, until one is to be trusted. Once, or once per picture.
     #[arg(long = "box", value_name = "X,Y,W,H|auto", value_parser = bounds, allow_hyphen_values = true, conflicts_with_all = ["cutout", "unseen"])]
     boxes: Vec<Bounds>,
     /// What counts in a picture: white, or opaque. What is black (something before the object) has no part in the search: the object may go on there.
@@ -321,7 +321,7 @@ impl Looking<'_> {
             pass(&shots.into_iter().map(|shot| Picture { shot, ..picture.clone() }).collect::<Vec<_>>(), starts)
         };
         let starts = |shot: &Shot| self.starts_of(shot, given);
-        let anywhere = Anywhere { engine: on.engine, model: on.model, open: &open, starts: &starts, places: PLACES };
+        let anywhere = Anywhere { engine: on.engine, model: on.model, open: &open, starts: &starts };
         let found = anywhere.search(&sightings, &mut named)?;
         // Where nothing differs from anything, it is the picture as it is.
         match found {

@@ -8,7 +8,7 @@ use glam::DMat4;
 use image::RgbImage;
 use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::photo::{Anywhere, BoundingBox, Follower, FoundObject, Known, Looking, Open, Outcome, PLACES, Shot, Sightings};
+use sigma_srn::photo::{Anywhere, BoundingBox, Follower, FoundObject, Known, Looking, Open, Outcome, Shot, Sightings};
 use sigma_srn::{Confidence, Doubt, Found, Pose6, Progress, Search, Tracked, Tracker};
 use srn_data::pixels::{ENDINGS, is_picture};
 use srn_data::target::{Cutout, photo};
@@ -292,7 +292,7 @@ fn looked_for(
     };
     let mut pass = |_: &[usize], shots: Vec<Shot>, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut observe)?);
     let sightings = Sightings::of(engine, model, instance, &photo(frame)?)?;
-    let found = Anywhere { engine, model, open, starts, places: PLACES }.search(&sightings, &mut pass);
+    let found = Anywhere { engine, model, open, starts }.search(&sightings, &mut pass);
     bar.finish_and_clear();
     let nothing = || format!("{}: nothing in it looks like {}", frame.display(), model.instance_name(instance));
     let Outcome { shot, found, .. } = found?.ok_or_else(nothing)?;

@@ -10,8 +10,6 @@ use crate::{Engine, Error, Found, Model, Progress, Search, Tracked, Tracker};
 const AS_EXPECTED: f64 = 0.9;
 /// As long as poses are not to be trusted, the object is searched for in every so many frames: all around where it was last seen, and from the second time on, anywhere.
 const SEARCHED: usize = 10;
-/// Where it may be elsewhere is looked for at so many places.
-const PLACES: usize = 2;
 /// What is found elsewhere leaves at most so many times unexplained what the object did where it was last seen: other things look like it, too.
 const ABOVE_SURE: f64 = 1.5;
 
@@ -168,7 +166,7 @@ impl Follower {
         let Looking { engine, model, search, starts, open, sightings } = *looking;
         let is_it = |found: &Found| found.is_trusted() && found.unexplained <= ABOVE_SURE * unexplained;
         let mut pass = |_: &[usize], shots, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut *observe)?);
-        let found = Anywhere { engine, model, open, starts, places: PLACES }.search(&sightings()?, &mut pass)?;
+        let found = Anywhere { engine, model, open, starts }.search(&sightings()?, &mut pass)?;
         Ok(found.map(|Outcome { shot, found, .. }| (shot, found)).filter(|(_, found)| is_it(found)))
     }
 

@@ -7,7 +7,7 @@ mod shown;
 mod sightings;
 mod template;
 
-pub use boxed::{Anywhere, Boxed, Outcome, PLACES, Pass, StartsOf};
+pub use boxed::{Anywhere, Boxed, Outcome, Pass, StartsOf};
 pub use follow::{Follower, Looking, Observe, Open};
 pub use shown::FoundObject;
 pub use sightings::{Sighting, Sightings};
@@ -170,7 +170,7 @@ impl Search {
         let single = self.single()?;
         let open = |bounds, known: Known| in_box(model, instance, photo, bounds, known);
         let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
-        let anywhere = Anywhere { engine, model, open: &open, starts: &starts, places: PLACES };
+        let anywhere = Anywhere { engine, model, open: &open, starts: &starts };
         let found = anywhere.search(&Sightings::of(engine, model, instance, photo.0)?, &mut pass)?;
         let nothing = || Error::Input { input: "photograph".into(), what: "nothing in it differs from what is around it".into() };
         found.map(|Outcome { shot, found, .. }| (shot, found)).ok_or_else(nothing)
