@@ -205,6 +205,6 @@ fn check(reports: &mpsc::Receiver<String>) -> Result<(), String> {
     println!("{report}");
     let off = |line: &str| line.split_once('°').and_then(|(angle, _)| angle.parse::<f64>().ok());
     let is_right = |line: &str| off(line).is_some_and(|angle| angle <= MOST_DEG) && line.contains(", trusted");
-    let is_right = report.lines().count() == 4 && report.lines().all(is_right);
+    let is_right = report.lines().count() == 5 && report.lines().all(is_right);
     if is_right { Ok(()) } else { Err("the poses found in the browser are not as they should be".into()) }
 }

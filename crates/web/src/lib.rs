@@ -68,8 +68,8 @@ impl Session {
     }
 
     /// The pose of an object in a photograph of RGBA pixels, `width` to a row, with the focal length `focal` in pixels and the principal point in its middle.
-    /// `bounds`: a box around the object (left edge, top edge, width and height in pixels), which is found in there. Without one the object is before white, in the middle square, or before
-    /// nothing: where anything is transparent, the square is cut around what is not. Light and outline of what is cut out, by either, are made up for.
+    /// `bounds`: a box around the object (left edge, top edge, width and height in pixels), which is found in there; no number at all: it is looked for in all of the photograph. Without them the
+    /// object is before white, in the middle square, or before nothing: where anything is transparent, the square is cut around what is not. Light and outline of what is cut out, by either, are made up for.
     /// `rough`: where the camera is within some 30° (4 × 4, row by row); of what is cut out it says from which side the object is seen. If there is none, it is looked for all around.
     /// `observe` is called with steps done, steps in all, and the best loss so far; a promise that it gives is waited for.
     #[wasm_bindgen(jspi)]
@@ -115,6 +115,7 @@ impl Session {
                 let bounds = BoundingBox { corner: [x, y], size: [width, height] };
                 search.run_in_box(&self.engine, model, instance, (&photo, &intrinsics), bounds, starts, observe)?
             }
+            Some([]) => search.run_anywhere(&self.engine, model, instance, (&photo, &intrinsics), starts, observe)?,
             Some(_) => return Err(JsError::new("a box has four numbers")),
             None => {
                 let square = photo.square([focal, focal, middle[0], middle[1]], self.side() as usize);
