@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use srn_photo::{Photo, Pixels};
 use srn_shaders::LinearParams;
 
-use super::template::{Cell, ROLL, ROLLS, SIDE, Template, WIDER, coarse, rolled_view};
+use super::template::{Cell, ROLL, ROLLS, SIDE, Template, Templates, WIDER, roll, rolled_view};
 use super::{BoundingBox, FoundObject, Shot, towards};
 use crate::camera::{around2016, pose_error};
 use crate::renderer::render_views;
@@ -44,7 +44,7 @@ const AT_PLACE: usize = 3;
 const SAME: f64 = 0.4;
 /// Degrees between sides that are not the same.
 const ELSEWHERE_DEG: f64 = 30.0;
-/// So many sides are tried at a place; what speaks for them is at least so much of what does for the likeliest.
+/// So many sides are tried at a place; what speaks for them is at least so much of what does for the one that was sighted.
 const SIDES: usize = 6;
 const NEARLY: f32 = 0.9;
 /// By so many degrees a side is turned, at first and at last, and at most so often.
@@ -65,6 +65,7 @@ pub struct Sightings<'a> {
     /// The model's, and the cameras that see them.
     views: Vec<Vec<f32>>,
     cameras: Vec<DMat4>,
+    templates: Templates,
     /// The likeliest first.
     matches: Vec<Match>,
 }
@@ -104,10 +105,10 @@ impl<'a> Sightings<'a> {
         let finer = (FINEST / size[0].max(size[1])).min(1.0);
         let [width, height] = size.map(|pixels| (finer * pixels).round().max(1.0) as usize);
         let looked = Looked::at(photo.pixels().area_resample(width, height));
-        let nothing = Sightings { engine, model, instance, looked, finer, views: vec![], cameras, matches: vec![] };
-        let views = nothing.views_from(&nothing.cameras)?;
-        let matches = nothing.looked.matches(&views);
-        Ok(Sightings { views, matches, ..nothing })
+        let views = views_from(engine, model, instance, &cameras)?;
+        let templates = Templates::of(&views);
+        let matches = looked.matches(&templates);
+        Ok(Sightings { engine, model, instance, looked, finer, views, cameras, templates, matches })
     }
 
     /// The likeliest places, the likeliest first, at most so many.
@@ -127,8 +128,9 @@ impl<'a> Sightings<'a> {
     /// From which sides the object may be seen at a place, each turned for as long as more speaks for it; the likeliest first, and at least the one that was sighted.
     pub fn sides(&self, place: Sighting) -> Result<Vec<Sighting>, Error> {
         let least = NEARLY * place.found.evidence;
+        let all = self.looked.all_around(place.found, &self.templates);
         let mut sides = vec![place];
-        for found in self.matches.iter().take_while(|found| found.evidence > least) {
+        for found in all.iter().take_while(|found| found.evidence > least) {
             if sides.len() < SIDES
                 && let Some(sighting) = self.sighting(found)
                 && sighting.bounds.overlap(&sides[0].bounds) >= SAME
@@ -186,16 +188,8 @@ impl<'a> Sightings<'a> {
         Ok(likelier.and_then(|(found, view, side)| self.seen(found, view, side)))
     }
 
-    /// What the model shows from cameras that have it in the middle, as templates are made of it.
     fn views_from(&self, cameras: &[DMat4]) -> Result<Vec<Vec<f32>>, Error> {
-        let view = |camera: &DMat4| {
-            let (focal, middle) = (SIDE as f64 * camera.w_axis.truncate().length() / WIDER, 0.5 * SIDE as f64);
-            let intrinsics = Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.5 };
-            (self.instance, *camera, intrinsics)
-        };
-        let views: Vec<View> = cameras.iter().map(view).collect();
-        let views = render_views(self.engine, self.model, [SIDE as u32; 2], &views)?;
-        Ok(views.into_iter().map(|view| view.rgb).collect())
+        views_from(self.engine, self.model, self.instance, cameras)
     }
 
     /// How much speaks for a pose that was found in a part of the photograph.
@@ -242,6 +236,18 @@ impl Sighting {
     }
 }
 
+/// What a model shows of an instance from cameras that have it in the middle, as templates are made of it.
+fn views_from(engine: &Engine, model: &Model, instance: u32, cameras: &[DMat4]) -> Result<Vec<Vec<f32>>, Error> {
+    let view = |camera: &DMat4| {
+        let (focal, middle) = (SIDE as f64 * camera.w_axis.truncate().length() / WIDER, 0.5 * SIDE as f64);
+        let intrinsics = Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, pixel_center: 0.5 };
+        (instance, *camera, intrinsics)
+    };
+    let views: Vec<View> = cameras.iter().map(view).collect();
+    let views = render_views(engine, model, [SIDE as u32; 2], &views)?;
+    Ok(views.into_iter().map(|view| view.rgb).collect())
+}
+
 fn likeliest_first(mut sightings: Vec<Sighting>) -> Vec<Sighting> {
     sightings.sort_by(|a, b| b.found.evidence.total_cmp(&a.found.evidence));
     sightings
@@ -272,28 +278,37 @@ impl Looked {
     }
 
     /// The most likely ones, the likeliest first.
-    fn matches(&self, views: &[Vec<f32>]) -> Vec<Match> {
-        let views: Vec<Template> = views.iter().map(|rgb| Template::of(rgb)).collect();
-        let templates = coarse(&views);
-        let matrices = Matrices::of(&templates);
+    fn matches(&self, templates: &Templates) -> Vec<Match> {
+        let matrices = Matrices::of(&templates.rolled);
         let [width, height] = [self.levels[0].width, self.levels[0].height].map(|side| side as f64);
         let largest = LARGEST * width.min(height);
         let sizes = std::iter::successors(Some(SMALLEST * width.max(height)), |size| Some(size * STEP))
             .take_while(|size| *size <= largest);
         let first: Vec<Match> = sizes.flat_map(|size| matrices.everywhere(&self.levels[0], size)).collect();
-        let half = |found: &Match| &templates[found.template][1];
+        let half = |found: &Match| &templates.rolled[found.template][1];
         let first = best(first.into_par_iter().map(|found| self.judged(found, half(&found))).collect(), BEST);
         let better = first.into_par_iter().map(|found| self.nearby(found, half(&found), 0.06)).collect();
-        let finer = |found: Vec<Match>, step: f32, turn: f32| {
-            let turned = |found: Match, turn: f32| {
-                let found = Match { roll: found.roll + turn, ..found };
-                self.nearby(found, &views[found.template / ROLLS].rolled(found.roll), step)
-            };
-            let of = |found: Match| [turned(found, -turn), turned(found, turn)].into_iter().fold(turned(found, 0.0), Match::or);
-            found.into_par_iter().map(of).collect()
+        let finest = self.finer(best(better, BETTER), templates, 0.03, ROLL / 3.0);
+        best(self.finer(finest, templates, 0.015, ROLL / 6.0), BETTER)
+    }
+
+    /// The most likely ones at a place, by every template, the likeliest first.
+    fn all_around(&self, place: Match, templates: &Templates) -> Vec<Match> {
+        let of = |(template, [_, half]): (usize, &[Template; 2])| {
+            self.settled(Match { template, roll: roll(template), ..place }, half)
         };
-        let finest = finer(best(better, BETTER), 0.03, ROLL / 3.0);
-        best(finer(finest, 0.015, ROLL / 6.0), BETTER)
+        let all = templates.rolled.par_iter().enumerate().map(of).collect();
+        best(self.finer(best(all, BETTER), templates, MOVED, ROLL / 3.0), BETTER)
+    }
+
+    /// The likeliest of each and what is next to it, by so much of the diagonal, and turned by so many radians.
+    fn finer(&self, found: Vec<Match>, templates: &Templates, step: f32, turn: f32) -> Vec<Match> {
+        let turned = |found: Match, turn: f32| {
+            let found = Match { roll: found.roll + turn, ..found };
+            self.nearby(found, &templates.views[found.template / ROLLS].rolled(found.roll), step)
+        };
+        let of = |found: Match| [turned(found, -turn), turned(found, turn)].into_iter().fold(turned(found, 0.0), Match::or);
+        found.into_par_iter().map(of).collect()
     }
 
     /// The likeliest of what is there, moved by a part of the diagonal, and so much larger and smaller.
@@ -518,7 +533,7 @@ impl Matrices {
                     (at as f32 + 0.5 * side as f32 - padding as f32) * pixels as f32 / cells as f32
                 };
                 let middle = [middle(x, picture.width, cells[0]), middle(y, picture.height, cells[1])];
-                Match { middle, diagonal: diagonal as f32, template, roll: (template % ROLLS) as f32 * ROLL, evidence }
+                Match { middle, diagonal: diagonal as f32, template, roll: roll(template), evidence }
             })
         };
         best((0..rows).into_par_iter().flat_map_iter(row).collect(), OF_SIZE)
@@ -607,15 +622,21 @@ mod tests {
     #[test]
     fn a_thing_is_found_where_it_is_as_large_and_turned_as_it_is() {
         let of_one_colour = view(|at| object(at).map(|_| [0.7, -0.8, -0.6]));
-        let views = [of_one_colour, view(object)];
+        let templates = Templates::of(&[of_one_colour, view(object)]);
         for (middle, diagonal, turn) in [([120.0, 90.0], 50.0, 0.4), ([70.0, 100.0], 80.0, 2.9), ([150.0, 60.0], 33.0, -1.5)] {
-            let found = Looked::at(picture(middle, diagonal, turn)).matches(&views)[0];
-            let off = (0..2).map(|k| (f64::from(found.middle[k]) - middle[k]).abs()).fold(0.0, f64::max);
-            let larger = f64::from(found.diagonal) / diagonal;
-            let turned = (f64::from(found.roll) - turn).rem_euclid(std::f64::consts::TAU);
-            let turned = turned.min(std::f64::consts::TAU - turned);
-            assert!(found.template / ROLLS == 1 && off < 0.06 * diagonal, "{middle:?}: {:?}", found.middle);
-            assert!((0.9..1.12).contains(&larger) && turned < 0.2, "{middle:?}: {larger} {turned}");
+            let looked = Looked::at(picture(middle, diagonal, turn));
+            let found = looked.matches(&templates)[0];
+            // From another side, beside it and larger.
+            let other = Match { template: 0, roll: 0.0, diagonal: 1.2 * found.diagonal, ..found };
+            let beside = Match { middle: found.middle.map(|at| at + 0.1 * found.diagonal), ..other };
+            for found in [found, looked.all_around(beside, &templates)[0]] {
+                let off = (0..2).map(|k| (f64::from(found.middle[k]) - middle[k]).abs()).fold(0.0, f64::max);
+                let larger = f64::from(found.diagonal) / diagonal;
+                let turned = (f64::from(found.roll) - turn).rem_euclid(std::f64::consts::TAU);
+                let turned = turned.min(std::f64::consts::TAU - turned);
+                assert!(found.template / ROLLS == 1 && off < 0.06 * diagonal, "{middle:?}: {:?}", found.middle);
+                assert!((0.9..1.12).contains(&larger) && turned < 0.2, "{middle:?}: {larger} {turned}");
+            }
         }
     }
 
@@ -623,7 +644,7 @@ mod tests {
     fn pictures_of_any_size_and_of_one_colour_have_places_or_none() {
         for [width, height] in [[1, 1], [3, 200], [40, 30]] {
             let pixels = Pixels { width, height, data: vec![0.3; 3 * width * height] };
-            let found = Looked::at(pixels).matches(&[view(object), view(|_| None)]);
+            let found = Looked::at(pixels).matches(&Templates::of(&[view(object), view(|_| None)]));
             assert!(found.iter().all(|found| found.evidence.is_finite()), "{width} × {height}");
         }
     }

@@ -138,11 +138,28 @@ fn blurred(values: &[Vec4]) -> Vec<Vec4> {
     along(&along(values, 1, |i| i % SIDE), SIDE, |i| i / SIDE)
 }
 
-/// Each view in each roll, in a quarter and half as many cells.
-pub(super) fn coarse(views: &[Template]) -> Vec<[Template; 2]> {
-    let of = |number: usize| {
-        let half = views[number / ROLLS].rolled((number % ROLLS) as f32 * ROLL).halved();
-        [half.halved(), half]
-    };
-    (0..views.len() * ROLLS).into_par_iter().map(of).collect()
+/// What an object looks like from all around.
+pub(super) struct Templates {
+    /// From each side.
+    pub views: Vec<Template>,
+    /// Of each view, in each roll: in a quarter and half as many cells.
+    pub rolled: Vec<[Template; 2]>,
+}
+
+impl Templates {
+    /// Of views of [`SIDE`] pixels, colours in [-1, 1].
+    pub fn of(views: &[Vec<f32>]) -> Self {
+        let views: Vec<Template> = views.iter().map(|rgb| Template::of(rgb)).collect();
+        let rolled = |number: usize| {
+            let half = views[number / ROLLS].rolled(roll(number)).halved();
+            [half.halved(), half]
+        };
+        let rolled = (0..views.len() * ROLLS).into_par_iter().map(rolled).collect();
+        Templates { views, rolled }
+    }
+}
+
+/// In radians, that of a template by its number among [`Templates::rolled`].
+pub(super) fn roll(number: usize) -> f32 {
+    (number % ROLLS) as f32 * ROLL
 }
