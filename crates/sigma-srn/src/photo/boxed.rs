@@ -18,6 +18,8 @@ const WHITE: f32 = 0.9;
 
 /// Room around what seems to be the object, as a share of the longer side of its box: what sticks out of it may be missing there.
 const ROOM: f64 = 0.15;
+/// More around that where the object's own colours say what is the object: what seemed to be it may be a part of it.
+const ROOM_BY_COLOURS: f64 = 0.4;
 /// At so many places where it seems to be an object is searched for: of 432 pictures of rooms it is at the first in 423, at the second in 6 (`docs/tried.md`).
 const PLACES: usize = 2;
 
@@ -150,6 +152,8 @@ pub struct Anywhere<'a, E> {
 
 /// So many sides from which it looks more like the object than it does as it was found are tried at a place.
 const RIVALS: usize = 3;
+/// So many times as much must speak for a rival that is not to be trusted where the pose is: for a right one it was 1.03 times, for wrong ones it is 1.08 or more (`docs/tried.md`).
+const SURER: f32 = 1.05;
 
 impl<E: From<Error>> Anywhere<'_, E> {
     /// Searches at the places where the object seems to be, the likeliest first, from the likeliest of the [`Sightings::sides`] there, until a pose is to be trusted, and nothing that looks more like the
@@ -177,7 +181,8 @@ impl<E: From<Error>> Anywhere<'_, E> {
         let mut best = None::<Outcome<L>>;
         for (bounds, sides, outcome) in outcomes {
             seconds -= outcome.found.seconds;
-            for outcome in self.at(bounds, |boxed| boxed.by_colours(&[0], vec![outcome], &mut *pass))? {
+            let wider = bounds.with_room(ROOM_BY_COLOURS);
+            for outcome in self.at(wider, |boxed| boxed.by_colours(&[0], vec![outcome], &mut *pass))? {
                 let is_found = outcome.found.is_trusted();
                 let outcome = if is_found { self.or_rival(sightings, &sides, outcome, &mut *pass)? } else { outcome };
                 let Outcome { found, .. } = &outcome;
@@ -194,7 +199,7 @@ impl<E: From<Error>> Anywhere<'_, E> {
         Ok(best)
     }
 
-    /// What looks more like the object from other sides is searched for from there, until one has more in the photograph that speaks for it, which counts.
+    /// What looks more like the object from other sides is searched for from there, until one has more in the photograph that speaks for it, by [`SURER`] where it is to be trusted less; it counts.
     fn or_rival<L>(
         &self,
         sightings: &Sightings,
@@ -203,11 +208,12 @@ impl<E: From<Error>> Anywhere<'_, E> {
         pass: Pass<L, E>,
     ) -> Result<Outcome<L>, E> {
         let evidence = |Outcome { shot, found, .. }: &Outcome<L>| sightings.evidence(shot, &found.world_from_camera);
-        let (least, mut seconds) = (evidence(&outcome)?, outcome.found.seconds);
+        let (own, mut seconds) = (evidence(&outcome)?, outcome.found.seconds);
         for rival in sightings.rivals(&outcome.shot, &outcome.found.world_from_camera, sides)?.into_iter().take(RIVALS) {
             let near = |shot: &Shot| Ok(neighbor4(&shot.facing(self.model, &rival.side)?));
             let Some((_, mut other)) = self.around(&rival, &near, &mut *pass)? else { continue };
             seconds += other.found.seconds;
+            let least = if outcome.found.is_trusted() && !other.found.is_trusted() { SURER * own } else { own };
             if evidence(&other)? > least {
                 other.found.seconds = seconds;
                 return Ok(other);
