@@ -4,6 +4,7 @@
 mod capture;
 mod photo;
 mod scene;
+mod several;
 mod sides;
 mod video;
 
@@ -21,11 +22,12 @@ use serde_json::Value;
 use srn_data::{sheet, srn};
 
 use crate::photo::{Lit, OUTSIDE, Photo, SIDE, Spoil, Spoiled, exposed};
+use crate::several::Lying;
 use crate::video::Video;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [rooms] [others] [sides] [video] [leaving] [captures] [--seed N] [--starts STARTS]";
+const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [rooms] [several] [others] [sides] [video] [leaving] [captures] [--seed N] [--starts STARTS]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -203,7 +205,7 @@ fn main() -> ExitCode {
 
 fn run() -> Result<()> {
     let (mut wanted, mut has_sides, mut has_video, mut has_captures) = (Vec::new(), false, false, false);
-    let mut has_leaving = false;
+    let (mut has_leaving, mut has_several) = (false, false);
     let (mut seed, mut starts) = (23, "around2016".to_string());
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
@@ -213,12 +215,14 @@ fn run() -> Result<()> {
             "sides" => has_sides = true,
             "video" => has_video = true,
             "leaving" => has_leaving = true,
+            "several" => has_several = true,
             "captures" => has_captures = true,
             name => wanted.push(TABLES.iter().find(|table| table.name == name).ok_or(USAGE)?),
         }
     }
-    if wanted.is_empty() && ![has_sides, has_video, has_leaving, has_captures].contains(&true) {
-        (wanted, has_sides, has_video, has_leaving, has_captures) = (TABLES.iter().collect(), true, true, true, true);
+    if wanted.is_empty() && ![has_several, has_sides, has_video, has_leaving, has_captures].contains(&true) {
+        (wanted, has_several) = (TABLES.iter().collect(), true);
+        (has_sides, has_video, has_leaving, has_captures) = (true, true, true, true);
     }
     let programs = Programs { folder: std::env::current_exe()?.parent().ok_or("no folder")?.into(), starts };
     let mut shown = Vec::new();
@@ -255,6 +259,9 @@ fn run() -> Result<()> {
             }
         }
     }
+    if has_several {
+        several(&programs, seed)?;
+    }
     if has_sides {
         sides(&programs, seed)?;
     }
@@ -272,6 +279,21 @@ fn run() -> Result<()> {
     }
     let cells: Vec<_> = shown.iter().map(|(picture, what)| (picture, *what)).collect();
     sheet::grid(&cells, COLUMNS).save(Path::new(OUT).join("sheet.png"))?;
+    Ok(())
+}
+
+/// The table of rooms with several objects.
+fn several(programs: &Programs, seed: u64) -> Result<()> {
+    println!("\nseveral, seed {seed}, made in {OUT}\n");
+    println!(
+        "| | effort | found within 5°, of those half in sight | told, of these wrong | rotation, mean / median / worst | \
+         translation, mean / median | a picture, median |\n|---|---|---|---|---|---|---|"
+    );
+    let views = programs.views(&in_room("several", 3.0, Spoil::Nothing), seed)?;
+    let rooms = |lying| several::rooms(lying, &views, &mut Pcg64Mcg::seed_from_u64(seed));
+    for (what, rooms) in [("beside each other", rooms(Lying::Apart)?), ("in a heap", rooms(Lying::Heaped)?)] {
+        println!("{}", several::found(programs, rooms, what, "fast")?);
+    }
     Ok(())
 }
 
