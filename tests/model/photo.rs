@@ -51,7 +51,7 @@ fn an_object_is_found_anywhere() {
     let model = Model::load(Path::new("../assets/models/compact.safetensors")).unwrap();
     let (engine, search, instance) = (Engine::cpu(), Search::of(Effort::Fast), model.instance("forklift").unwrap());
     let photo = scene();
-    let sightings = Sightings::of(&engine, &model, instance, &photo).unwrap();
+    let sightings = Sightings::of(&engine, &model, instance, &photo, &[]).unwrap();
     let first = sightings.likeliest(1).remove(0);
     assert!(first.bounds.overlap(&FORKLIFT) > 0.5, "{:?}", first.bounds);
     let starts = |shot: &Shot| shot.around(&model, camera::around2016, None);
@@ -79,6 +79,34 @@ fn an_object_is_found_anywhere() {
     assert!(
         said.as_ref().is_ok_and(|is_trusted| !is_trusted) || said.is_err_and(|error| error.to_string().contains("nothing in it"))
     );
+}
+
+/// Both of one kind, in a heap.
+#[test]
+fn all_objects_of_a_model_are_found_that_are_there() {
+    let model = Model::load(Path::new("../assets/models/compact.safetensors")).unwrap();
+    let model = model.bake(&[model.instance("seat").unwrap()]).unwrap();
+    let picture = image::open("../assets/scenes/heap.png").unwrap().to_rgba8();
+    let photo = Photo::from_rgba8(picture.width() as usize, picture.height() as usize, &picture).unwrap();
+    let intrinsics = Intrinsics { fx: 600.0, fy: 600.0, cx: 320.0, cy: 240.0, pixel_center: 0.0 };
+    let starts = |shot: &Shot| shot.around(&model, camera::around2016, None);
+    let engine = Engine::cpu();
+    let found = Search::of(Effort::Fast).run_for_all(&engine, &model, (&photo, &intrinsics), starts, |_| Ok(())).unwrap();
+    let truths = std::fs::read_to_string("../assets/scenes/heap.txt").unwrap();
+    let seats = truths.lines().filter_map(|line| line.strip_prefix("seat "));
+    let mut seats: Vec<glam::DMat4> = seats
+        .map(|rows| {
+            let rows: Vec<f64> = rows.split(' ').map(|number| number.parse().unwrap()).collect();
+            glam::DMat4::from_cols_slice(&rows).transpose()
+        })
+        .collect();
+    assert_eq!((found.len(), seats.len()), (2, 2));
+    for (shot, found) in found {
+        let off = |seat: &glam::DMat4| camera::pose_error(&found.world_from_camera, seat);
+        seats.sort_by(|a, b| off(a).0.total_cmp(&off(b).0));
+        let (angle, distance) = off(&seats.remove(0));
+        assert!(shot.instance == 0 && found.is_trusted() && angle < 1.5 && distance < 0.1, "{angle} {distance}");
+    }
 }
 
 #[test]

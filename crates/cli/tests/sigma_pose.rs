@@ -360,6 +360,7 @@ fn pictures_and_what_is_said_of_them_come_on_stdin() {
     for (line, said) in [
         (r#"{"image": "photo.png", "instance": "seat", "box": [500, 500, 9, 9]}"#, "box 500"),
         (r#"{"image": "photo.png", "instance": "stool"}"#, "stool"),
+        (r#"{"image": "photo.png", "box": "auto"}"#, "which object"),
         (r#"{"image": "photo.png", "where": 1}"#, "where"),
         ("no-such.png", "no-such.png"),
     ] {
@@ -952,6 +953,20 @@ fn a_box_around_the_object_is_enough() {
     assert!(off < 1.5 && all[0]["trusted"] == true && all[1]["trusted"] == false, "{all}");
     assert!(files(&dir.join("anywhere")).contains(&"seat-photo-outline.png".into()));
     fail(dir, &format!("estimate photo.png {args} --box there --intrinsics camera.txt"), &["--box", "auto"]);
+
+    // Nor which it is.
+    let any = format!("--model {SHIPPED} --executor cpu --effort fast --box auto --intrinsics camera.txt");
+    let told = json(&run(dir, &format!("estimate photo.png table.png {any} --json --record all"), 1))["images"].take();
+    let told = told.as_array().unwrap();
+    let seats: Vec<_> = told.iter().filter(|told| told["instance"] == "seat").collect();
+    let at = |found: &Value, k: usize| found[k][3].as_f64().unwrap();
+    assert!(seats.len() == 1 && seats[0]["trusted"] == true, "{told:?}");
+    assert!((0..3).all(|k| (at(&seats[0]["world_from_camera"], k) - at(&found_alone, k)).abs() < 0.05), "{}", seats[0]);
+    let nothing = &told[told.len() - 1];
+    assert!(nothing["image"] == "table.png" && nothing["failure"].as_str().unwrap().contains("none"), "{nothing}");
+    assert_eq!(files(&dir.join("all")), ["photo-outline.png", "table-outline.png"]);
+    fail(dir, &format!("estimate photo.png {any} --truth DATA/seat/pose/000006.txt"), &["--truth", "--instance"]);
+    fail(dir, &format!("estimate photo.png {any} --record all"), &["photo-outline.png", "--force"]);
 }
 
 /// The seat goes to the right; once something is before the whole camera, once before the seat, and once longer.

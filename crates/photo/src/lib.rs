@@ -11,4 +11,4 @@ pub mod silhouettes;
 
 pub use photo::{MARGIN, Photo, Square};
 pub use pixels::Pixels;
-pub use segment::{BoundingBox, Guess, Known};
+pub use segment::{BoundingBox, Guess, Known, Place};

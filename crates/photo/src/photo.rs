@@ -72,17 +72,24 @@ impl Photo {
         }
     }
 
-    /// Leaves what in a box is the object, by its colours and what is known of it; `None`, with nothing changed, where nothing in the box differs from what is around it,
-    /// or nothing is around it.
+    /// Leaves what in a box is the object, by its colours and what is known of it, and where something else is seen nothing counts; `None`, with nothing changed, where nothing in the box differs from
+    /// what is around it, or nothing is around it.
     pub fn cut_out_of(&mut self, bounds: BoundingBox, known: Known) -> Option<()> {
         let object = object_in(&self.pixels, bounds, known)?;
         self.cut_out(&object);
+        if known.others.is_some() {
+            let [width, height] = self.size();
+            let centre = |i: usize| [i % width, i / width].map(|at| at as f64 + 0.5);
+            self.mask((0..width * height).map(|i| if known.is_other(centre(i)) { 0.0 } else { 1.0 }).collect());
+        }
         Some(())
     }
 
-    /// How much each pixel counts, 0 to 1 `[height · width]`, those that are missing there not at all: what does not may be anything.
+    /// How much each pixel counts at most, 0 to 1 `[height · width]`, those that are missing there not at all: what does not may be anything.
     pub fn mask(&mut self, mut counts: Vec<f32>) {
         counts.resize(self.opacity.len(), 0.0);
+        let before = self.counts.take().into_iter().flatten();
+        counts.iter_mut().zip(before).for_each(|(counts, before)| *counts = counts.min(before));
         self.counts = Some(counts);
     }
 

@@ -20,6 +20,9 @@ pub struct BoundingBox {
 /// Whether a place of the picture, across and down in pixels, is thought to show the object; `None`: that is not known.
 pub type Guess<'a> = &'a dyn Fn([f64; 2]) -> Option<bool>;
 
+/// Whether a place of the picture, likewise, is in a region.
+pub type Place<'a> = &'a dyn Fn([f64; 2]) -> bool;
+
 /// Room around the box from which the surroundings are learnt, as a share of its longer side.
 const SURROUNDINGS: f64 = 0.3;
 /// How far the object may reach out of the box, likewise; and where it is guessed.
@@ -46,6 +49,15 @@ pub struct Known<'a> {
     pub colours: &'a [[f32; 3]],
     /// Where it is thought to be, as by a pose; what colours say of its edge goes before.
     pub place: Option<Guess<'a>>,
+    /// Where something else is seen, before the object or beside it.
+    pub others: Option<Place<'a>>,
+}
+
+impl Known<'_> {
+    /// Whether something else is seen at a place.
+    pub(crate) fn is_other(&self, at: [f64; 2]) -> bool {
+        self.others.is_some_and(|is_other| is_other(at))
+    }
 }
 
 /// How much of each pixel is the object, 0 to 1, `[height · width]`. `None` where nothing of the box differs from what is around it, or nothing is around it.
@@ -53,7 +65,8 @@ pub(crate) fn object_in(picture: &Pixels, bounds: BoundingBox, known: Known) -> 
     let grid = Grid::around(picture, bounds)?;
     let longer = bounds.size[0].max(bounds.size[1]);
     let slack = longer * if known.place.is_some() { SLACK_OF_GUESS } else { SLACK };
-    let may_be = grid.each(|at| bounds.is_within(at, slack));
+    let is_other = grid.each(|at| known.is_other(at));
+    let may_be = grid.each(|at| bounds.is_within(at, slack) && !known.is_other(at));
     let guess = match known.place {
         Some(place) => grid.each(|at| if bounds.is_within(at, slack) { place(at) } else { Some(false) }),
         None => grid.each(|at| Some(bounds.is_within(at, 0.0))),
@@ -64,7 +77,7 @@ pub(crate) fn object_in(picture: &Pixels, bounds: BoundingBox, known: Known) -> 
     let edges = grid.edges();
     for round in 0..ROUNDS {
         // What nobody knows yet says nothing of either.
-        let is_on = |i: usize, of: bool| if round == 0 { guess[i] == Some(of) } else { object[i] == of };
+        let is_on = |i: usize, of: bool| !is_other[i] && if round == 0 { guess[i] == Some(of) } else { object[i] == of };
         let side = |of: bool| grid.colours.iter().enumerate().filter(move |(i, _)| is_on(*i, of)).map(|(_, colour)| *colour);
         let mut own = side(true).collect::<Vec<_>>();
         // At first the box has other things in it, too.
@@ -313,8 +326,19 @@ mod tests {
         let by_place = found(Known { place: Some(&place), ..Known::default() });
         assert!(wrong(&by_place, is_middle) < area / 10, "{} of {area}", wrong(&by_place, is_middle));
         let blue = [[-0.8, -0.6, 0.7], [-0.75, -0.55, 0.65], [-0.85, -0.65, 0.75]].repeat(20);
-        let by_colours = found(Known { colours: &blue, place: None });
+        let by_colours = found(Known { colours: &blue, ..Known::default() });
         assert!(wrong(&by_colours, is_middle) < area / 10, "{} of {area}", wrong(&by_colours, is_middle));
+    }
+
+    #[test]
+    fn what_something_else_covers_says_nothing() {
+        let picture = picture();
+        // The middle is of another thing, which hides it, and the box ends where that does.
+        let is_other = |[x, y]: [f64; 2]| from_middle(y as usize * WIDTH + x as usize) < 0.45;
+        let found = object_in(&picture, BOX, Known { others: Some(&is_other), ..Known::default() }).unwrap();
+        let is_object = |i| (0.45..1.0).contains(&from_middle(i));
+        let area = (0..found.len()).filter(|&i| is_object(i)).count();
+        assert!(wrong(&found, is_object) < area / 20, "{} of {area}", wrong(&found, is_object));
     }
 
     #[test]

@@ -35,7 +35,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             Ok(Shot::in_box((&photo, &intrinsics), bounds, known, instance, side).ok_or("nothing in the box")?)
         };
         let starts = |shot: &Shot| -> Result<_, Box<dyn Error>> { Ok(shot.around(&model, around2016, None)?) };
-        let sightings = || Ok(Sightings::of(&engine, &model, instance, &photo)?);
+        let sightings = || Ok(Sightings::of(&engine, &model, instance, &photo, &[])?);
         let looking =
             Looking { engine: &engine, model: &model, search: &search, starts: &starts, open: &open, sightings: &sightings };
         let shot = follower.open(&open).ok();

@@ -8,13 +8,14 @@ use clap::Args;
 use glam::DMat4;
 use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::photo::{Anywhere, Boxed, Known, Outcome, Shot, Sightings};
+use sigma_srn::photo::{All, Anywhere, Boxed, Known, Outcome, Place, Shot, Sightings};
 use sigma_srn::{Confidence, Doubt, Engine, Error, Found, Light, Model, Pose6, Progress, Search};
 use srn_data::camera::Axes;
 use srn_data::target::photo;
 
 use super::files::{
-    Bounds, ObjectArgs, Picture, PoseSource, bounds, lines_on_stdin, model_side, path_of, srn_instance, warn_of_turned,
+    Bounds, ObjectArgs, Picture, PoseSource, bounds, instance_of, lines_on_stdin, model_side, path_of, srn_instance,
+    warn_of_turned,
 };
 use super::given::Given;
 use super::mask::MadeRight;
@@ -54,7 +55,8 @@ pub struct Estimate {
     cutout: Vec<PathBuf>,
     /// A box around the object, as detectors give it, instead of a segmentation: left edge, top edge, width and height in pixels of the picture. What in it is the
     /// object is found by its colours, and then by the pose that was found with these, from where the search is done once more. `auto`: it is looked for in all of the
-    /// picture, by how the model shows it from all around, and a pose is searched for at up to two places, until one is to be trusted. Once, or once per picture.
+    /// picture, by how the model shows it from all around, and a pose is searched for at up to two places, until one is to be trusted; where nobody says which object it
+    /// is, all of the model's are looked for, and those that are there for sure are told. Once, or once per picture.
     #[arg(long = "box", value_name = "X,Y,W,H|auto", value_parser = bounds, allow_hyphen_values = true, conflicts_with_all = ["cutout", "unseen"])]
     boxes: Vec<Bounds>,
     /// What counts in a picture: white, or opaque. What is black (something before the object) has no part in the search: the object may go on there.
@@ -76,7 +78,8 @@ pub struct Estimate {
     /// Print everything as JSON.
     #[arg(long)]
     json: bool,
-    /// Write to this folder, of each search, a picture, an animation, and the found object's outline on the picture as it was given.
+    /// Write to this folder, of each search, a picture, an animation, and the found object's outline on the picture as it was given; where all objects are looked for, their
+    /// outlines.
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
     /// Write the pictures whose poses are trusted to this folder, as views of a data set that is as the model's was: for `sigma-train adapt --more`.
@@ -221,7 +224,9 @@ pub fn run(args: &Estimate) -> Result<bool> {
         }
         refuse_to_write(path, args.force)?;
     }
-    let instances = asked.iter().map(|asked| asked.picture.shot.instance);
+    let is_for_all = asked.iter().any(|asked| args.is_for_all(&asked.given, &model));
+    let every = if is_for_all { 0..model.layout.instances } else { 0..0 };
+    let instances = asked.iter().map(|asked| asked.picture.shot.instance).chain(every);
     let saved = args.save_views.as_ref().map(|dir| SavedViews::create(dir, &model, instances, args.force)).transpose()?;
     let engine = args.search.open(&args.engine)?;
     let on = On { engine: &engine, model: &model, side };
@@ -271,10 +276,18 @@ type Pass<'a> = &'a mut dyn FnMut(&[Picture], &[Vec<DMat4>]) -> Result<Vec<Outco
 impl Estimate {
     /// A picture; if it has a box, with what is `known` of the object in it.
     fn open(&self, given: &Given, model: &Model, side: u32, known: Known) -> Result<Picture> {
-        // Of an object that the model does not know the number says nothing.
-        let any = self.unseen.then(|| model.instance_name(0));
+        // Of an object that the model does not know the number says nothing, nor where all are looked for.
+        let any = (self.unseen || self.is_for_all(given, model)).then(|| model.instance_name(0));
         let instance = any.as_deref().or(self.object.instance.as_deref());
-        given.open(model, side, instance, &self.object.camera, known)
+        let picture = given.open(model, side, instance, &self.object.camera, known)?;
+        let stem = || given.image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(if self.is_for_all(given, model) { Picture { name: stem(), ..picture } } else { picture })
+    }
+
+    /// Whether nobody says which object is in a picture, nor where.
+    fn is_for_all(&self, given: &Given, model: &Model) -> bool {
+        let is_named = given.instance.is_some() || self.object.instance.is_some() || srn_instance(&given.image).is_some();
+        given.bounds == Some(Bounds::Anywhere) && !is_named && model.layout.instances > 1
     }
 }
 
@@ -283,50 +296,64 @@ impl Looking<'_> {
         self.args.search.starts(self.starts, self.model, shot, given.rough.as_ref(), self.notation)
     }
 
-    /// Searches for pictures, all of which have boxes, or none.
-    fn find(&self, on: On, asked: &[Asked], pass: Pass) -> Result<Vec<Outcome<Noted>>> {
+    /// Searches for pictures, all of which have boxes, or none. What was found of each: of all objects of the model those that are to be trusted.
+    fn find(&self, on: On, asked: &[Asked], look: &dyn Fn(u32), pass: Pass) -> Result<Vec<Vec<Outcome<Noted>>>> {
         if asked.iter().all(|asked| asked.given.bounds.is_none()) {
             let starts = asked.iter().map(|Asked { picture, given, .. }| self.starts_of(&picture.shot, given));
             let pictures: Vec<_> = asked.iter().map(|asked| asked.picture.clone()).collect();
-            return pass(&pictures, &starts.collect::<Result<Vec<_>>>()?);
+            return Ok(one_each(pass(&pictures, &starts.collect::<Result<Vec<_>>>()?)?));
         }
         let is_anywhere = |asked: &Asked| asked.given.bounds == Some(Bounds::Anywhere);
-        if asked.len() > 1 && asked.iter().any(is_anywhere) {
-            let each = asked.iter().map(|asked| Ok(self.find(on, std::slice::from_ref(asked), pass)?.remove(0)));
-            return each.collect();
-        }
         if asked.iter().any(is_anywhere) {
-            return Ok(vec![self.anywhere(on, &asked[0], pass)?]);
+            if let [asked] = asked {
+                return Ok(vec![self.anywhere(on, asked, look, pass)?]);
+            }
+            let each = asked.iter().map(|asked| Ok(self.find(on, std::slice::from_ref(asked), look, pass)?.remove(0)));
+            return each.collect();
         }
         let open = |i: usize, known: Known| Ok(self.args.open(&asked[i].given, on.model, on.side, known)?.shot);
         let starts = |i: usize, shot: &Shot| self.starts_of(shot, &asked[i].given);
         let boxed = Boxed { engine: on.engine, model: on.model, open: &open, starts: &starts };
         let shots = asked.iter().map(|asked| asked.picture.shot.clone()).collect();
         let numbers: Vec<usize> = (0..asked.len()).collect();
-        boxed.search(&numbers, shots, &mut |numbers: &[usize], shots, starts: &[_]| {
+        let found = boxed.search(&numbers, shots, &mut |numbers: &[usize], shots, starts: &[_]| {
             let named = |(&i, shot): (&usize, _)| Picture { shot, ..asked[i].picture.clone() };
             pass(&numbers.iter().zip(shots).map(named).collect::<Vec<_>>(), starts)
-        })
+        });
+        Ok(one_each(found?))
     }
 
-    /// Searches for the object in a picture where it seems to be.
-    fn anywhere(&self, on: On, Asked { given, picture, .. }: &Asked, pass: Pass) -> Result<Outcome<Noted>> {
+    /// Searches for the object in a picture where it seems to be, or for all of the model's.
+    fn anywhere(
+        &self,
+        on: On,
+        Asked { given, picture, .. }: &Asked,
+        look: &dyn Fn(u32),
+        pass: Pass,
+    ) -> Result<Vec<Outcome<Noted>>> {
+        let On { engine, model, side } = on;
         let photo = photo(&given.image)?;
-        let sightings = Sightings::of(on.engine, on.model, picture.shot.instance, &photo)?;
-        let open = |bounds, known: Known| {
-            let given = Given { bounds: Some(Bounds::Box(bounds)), ..given.clone() };
-            Ok(self.args.open(&given, on.model, on.side, known)?.shot)
-        };
+        let starts = |shot: &Shot| self.starts_of(shot, given);
         let mut named = |_: &[usize], shots: Vec<Shot>, starts: &[_]| {
             pass(&shots.into_iter().map(|shot| Picture { shot, ..picture.clone() }).collect::<Vec<_>>(), starts)
         };
-        let starts = |shot: &Shot| self.starts_of(shot, given);
-        let anywhere = Anywhere { engine: on.engine, model: on.model, open: &open, starts: &starts };
-        let found = anywhere.search(&sightings, &mut named)?;
+        let mut search = |instance: u32, sightings: &Sightings, others: Option<Place>| {
+            let open = |bounds, known: Known| {
+                let (instance, bounds) = (Some(model.instance_name(instance)), Some(Bounds::Box(bounds)));
+                let given = Given { instance, bounds, ..given.clone() };
+                Ok(self.args.open(&given, model, side, Known { others, ..known })?.shot)
+            };
+            Anywhere { engine, model, open: &open, starts: &starts }.search(sightings, &mut named)
+        };
+        if self.args.is_for_all(given, model) {
+            return All { engine, model, photo: &photo }.search(0..model.layout.instances, look, search);
+        }
+        let instance = picture.shot.instance;
+        let found = search(instance, &Sightings::of(engine, model, instance, &photo, &[])?, None)?;
         // Where nothing differs from anything, it is the picture as it is.
         match found {
-            Some(found) => Ok(found),
-            None => Ok(named(&[0], vec![picture.shot.clone()], &[starts(&picture.shot)?])?.remove(0)),
+            Some(found) => Ok(vec![found]),
+            None => named(&[0], vec![picture.shot.clone()], &[starts(&picture.shot)?]),
         }
     }
 
@@ -335,6 +362,10 @@ impl Looking<'_> {
         let search = &self.args.search;
         if is_boxed { Ok(search.single(search.options()?)) } else { search.search() }
     }
+}
+
+fn one_each<T>(all: Vec<T>) -> Vec<Vec<T>> {
+    all.into_iter().map(|one| vec![one]).collect()
 }
 
 /// Searches for pictures, and tells what was noted of each.
@@ -375,18 +406,30 @@ fn searched(looking: &Looking, all: &[Asked], mut saved: Option<SavedViews>, out
         bar.set_message("");
         Ok(outcomes)
     };
+    let look = |instance| bar.set_message(format!("looking for {}", on.model.instance_name(instance)));
     for asked in all.chunks(AT_ONCE) {
-        let outcomes = looking.find(on, asked, &mut pass)?;
-        let named = |(asked, outcome): (&Asked, &Outcome<_>)| Picture { shot: outcome.shot.clone(), ..asked.picture.clone() };
-        let pictures: Vec<Picture> = asked.iter().zip(&outcomes).map(named).collect();
-        for ((asked, picture), Outcome { found, .. }) in asked.iter().zip(&pictures).zip(&outcomes) {
-            output.add(asked, picture, found, found.estimate.ranking.len(), &bar)?;
-            saved.iter_mut().try_for_each(|saved| saved.add(picture, found, on.side))?;
+        let outcomes = looking.find(on, asked, &look, &mut pass)?;
+        for (asked, outcomes) in asked.iter().zip(&outcomes) {
+            for (number, Outcome { shot, found, .. }) in outcomes.iter().enumerate() {
+                let name = &asked.picture.name;
+                let name = if number > 0 { format!("{name}-{number}") } else { name.clone() };
+                let picture = Picture { name, shot: shot.clone(), ..asked.picture };
+                output.add(asked, &picture, found, found.estimate.ranking.len(), &bar)?;
+                saved.iter_mut().try_for_each(|saved| saved.add(&picture, found, on.side))?;
+            }
+            if outcomes.is_empty() {
+                output.nothing(asked, &bar)?;
+            }
         }
-        if let Some(dir) = &args.record {
-            for ((asked, picture), Outcome { found, log: (log, i), .. }) in asked.iter().zip(&pictures).zip(&outcomes) {
-                log.write(dir, *i, picture, found, on)?;
-                outline::write(dir, &asked.given.image, picture, found, on)?;
+        let Some(dir) = &args.record else { continue };
+        for (Asked { given, picture, .. }, outcomes) in asked.iter().zip(&outcomes) {
+            let found: Vec<_> = outcomes.iter().map(|Outcome { shot, found, .. }| (shot, found)).collect();
+            outline::write(dir, &given.image, &picture.name, &found, on)?;
+            if args.is_for_all(given, on.model) {
+                continue;
+            }
+            for Outcome { shot, found, log: (log, i) } in outcomes {
+                log.write(dir, *i, &Picture { shot: shot.clone(), ..picture.clone() }, found, on)?;
             }
         }
     }
@@ -468,6 +511,10 @@ fn of_line(args: &Estimate, model: &Model, engine: &Engine, notation: &Notation,
     let on = On { engine, model, side };
     let looking = Looking { args, model, starts: &starts(args, given.rough.is_some())?, notation };
     warn_of_turned(&given.image);
+    if args.is_for_all(&given, model) {
+        // One line for each line.
+        instance_of(model, None)?;
+    }
     let picture = args.open(&given, model, side, Known::default())?;
     let source = args.poses.source(srn_instance(&given.image).as_deref())?;
     let settings = looking.settings(given.bounds.is_some())?;
@@ -480,9 +527,9 @@ fn of_line(args: &Estimate, model: &Model, engine: &Engine, notation: &Notation,
             Ok(())
         })
     };
-    let found = looking.find(on, std::slice::from_ref(&asked), &mut pass);
+    let found = looking.find(on, std::slice::from_ref(&asked), &|_| (), &mut pass);
     bar.finish_and_clear();
-    let Outcome { shot, found, .. } = found?.remove(0);
+    let Outcome { shot, found, .. } = found?.remove(0).remove(0);
     let picture = Picture { shot, ..asked.picture.clone() };
     let image = Output { args, on, notation, failures: vec![], images: vec![] }.image(&asked, &picture, &found);
     let line = || image.line(&found, found.estimate.ranking.len(), notation);
@@ -527,6 +574,9 @@ fn pictures(args: &Estimate, model: &Model, side: u32, notation: &Notation) -> R
     let (mut names, mut asked, mut failures) = (HashSet::new(), Vec::new(), Vec::new());
     for (number, given) in given(args, notation)?.into_iter().enumerate() {
         warn_of_turned(&given.image);
+        if args.is_for_all(&given, model) && given.rough.or(given.truth).is_some() {
+            return Err("--rough and --truth are of one object: give --instance".into());
+        }
         let mut picture = match args.open(&given, model, side, Known::default()) {
             Ok(picture) => picture,
             // A detector may see what is not there, which says nothing of the other pictures.
@@ -568,6 +618,16 @@ impl Output<'_> {
         }
         self.images.push(Entry::Found(Box::new(image)));
         Ok(())
+    }
+
+    /// Tells that no object is in a picture.
+    fn nothing(&mut self, Asked { number, given, .. }: &Asked, bar: &ProgressBar) -> Result<()> {
+        let failure = "none of the model's objects is there for sure".into();
+        bar.suspend(|| {
+            self.fail(*number)?;
+            self.failures.insert(0, Failed { number: *number, image: given.image.clone(), trusted: false, failure });
+            self.fail(number + 1)
+        })
     }
 
     /// Tells of those pictures before this number in which no object is.

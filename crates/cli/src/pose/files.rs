@@ -28,7 +28,7 @@ pub struct ObjectArgs {
     #[arg(long, value_name = "FILE")]
     pub model: PathBuf,
     /// Name of the object in the pictures, or its number where the model has no names. Default: the name of the SRN folder that a picture lies in, else the model's
-    /// only one.
+    /// only one, or, with `estimate --box auto`, all.
     #[arg(long, value_name = "NAME")]
     pub instance: Option<String>,
     #[command(flatten)]

@@ -9,7 +9,6 @@ use sigma_srn::photo::{FoundObject, Shot};
 use srn_data::pixels::{open, rgb8};
 use srn_data::sheet::{self, BLACK, Colour};
 
-use super::files::Picture;
 use super::search::On;
 use crate::common::{Result, write_picture};
 
@@ -20,12 +19,15 @@ const FINEST: usize = 4;
 /// Shorter pictures are enlarged until they have this height, pixels.
 const LEAST_HEIGHT: u32 = 320;
 
-/// Writes `NAME-outline.png` of the picture at `path` to `dir`.
-pub fn write(dir: &Path, path: &Path, picture: &Picture, found: &Found, on: On) -> Result<()> {
+/// Writes `NAME-outline.png` of the picture at `path` to `dir`, with what was found in it.
+pub fn write(dir: &Path, path: &Path, name: &str, found: &[(&Shot, &Found)], on: On) -> Result<()> {
     let photo = photograph(path)?;
-    let page = sheet::enlarge(&photo, LEAST_HEIGHT.div_ceil(photo.height()));
-    let object = FoundObject::of(&picture.shot, &found.world_from_camera, on.engine, on.model, FINEST)?;
-    write_picture(&dir.join(format!("{}-outline.png", picture.name)), &outlined(page, photo.height(), &object))
+    let mut page = sheet::enlarge(&photo, LEAST_HEIGHT.div_ceil(photo.height()));
+    for (shot, found) in found {
+        let object = FoundObject::of(shot, &found.world_from_camera, on.engine, on.model, FINEST)?;
+        page = outlined(page, photo.height(), &object);
+    }
+    write_picture(&dir.join(format!("{name}-outline.png")), &page)
 }
 
 /// The picture at `path`, so many pixels high, with the outline on it, which is as fine as the model's own view.

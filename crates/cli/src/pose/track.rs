@@ -210,7 +210,7 @@ pub fn run(args: &Track) -> Result<bool> {
             }
             Ok(())
         };
-        let sightings = || Ok(Sightings::of(&engine, &model, instance, &photo(&path)?)?);
+        let sightings = || Ok(Sightings::of(&engine, &model, instance, &photo(&path)?, &[])?);
         let tracked = with_cooperative_said(&engine, || match (&mut follower, shot) {
             (Some(follower), shot) => {
                 let (search, starts, open, sightings) = (&search, &starts, &boxed, &sightings);
@@ -291,7 +291,7 @@ fn looked_for(
         Ok(())
     };
     let mut pass = |_: &[usize], shots: Vec<Shot>, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut observe)?);
-    let sightings = Sightings::of(engine, model, instance, &photo(frame)?)?;
+    let sightings = Sightings::of(engine, model, instance, &photo(frame)?, &[])?;
     let found = Anywhere { engine, model, open, starts }.search(&sightings, &mut pass);
     bar.finish_and_clear();
     let nothing = || format!("{}: nothing in it looks like {}", frame.display(), model.instance_name(instance));

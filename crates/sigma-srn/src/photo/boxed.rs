@@ -65,7 +65,7 @@ impl<E: From<Error>> Boxed<'_, E> {
         for (i, Outcome { shot, .. }) in outcomes.iter().enumerate().filter(|(_, outcome)| !outcome.found.is_trusted()) {
             let colours = self.colours(shot.instance)?;
             // Nothing in the box may have those colours.
-            if let Ok(shot) = (self.open)(numbers[i], Known { colours: &colours, place: None }) {
+            if let Ok(shot) = (self.open)(numbers[i], Known { colours: &colours, ..Known::default() }) {
                 lost.push(i);
                 anew.push(shot);
             }
@@ -113,7 +113,7 @@ impl<E: From<Error>> Boxed<'_, E> {
         for (&number, before) in numbers.iter().zip(before) {
             let Outcome { shot, found, .. } = before.borrow();
             let object = FoundObject::of(shot, &found.world_from_camera, self.engine, self.model, 1)?;
-            let cut = (self.open)(number, Known { colours: &[], place: Some(&|at| object.shows(at)) });
+            let cut = (self.open)(number, Known { place: Some(&|at| object.shows(at)), ..Known::default() });
             // Or nothing, where the pose is far off.
             shots.push(cut.unwrap_or_else(|_| shot.clone()));
         }
@@ -157,15 +157,17 @@ const SURER: f32 = 1.05;
 
 impl<E: From<Error>> Anywhere<'_, E> {
     /// Searches at the places where the object seems to be, the likeliest first, from the likeliest of the [`Sightings::sides`] there, until a pose is to be trusted, and nothing that looks more like the
-    /// object ([`Sightings::rivals`]) leads to a better one; if none is, once more by the colours of the model's object, first where the least is left unexplained; then the least counts. `None` where no place
-    /// differs from what is around it.
+    /// object ([`Sightings::rivals`]) leads to a better one; if none is, once more by the colours of the model's object, first where the least is left unexplained; then the least counts. Where it hardly is
+    /// ([`Sighting::is_likely`]) it is searched for once, at the likeliest place. `None` where no place differs from what is around it.
     pub fn search<L>(&self, sightings: &Sightings, pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
         let mut outcomes = Vec::new();
-        for sighting in sightings.likeliest(PLACES) {
+        let places = sightings.likeliest(PLACES);
+        let likely = places.iter().filter(|place| place.is_likely()).count();
+        for sighting in places.into_iter().take(likely.max(1)) {
             let sides = sightings.sides(sighting)?;
             let Some((bounds, outcome)) = self.around(&sides[0], self.starts, &mut *pass)? else { continue };
             // A mask that has something else in it may lead anywhere, but where it is the likeliest the object mostly is.
-            let is_worth_it = outcomes.is_empty() || outcome.found.is_trusted();
+            let is_worth_it = outcomes.is_empty() && likely > 0 || outcome.found.is_trusted();
             let outcome = if is_worth_it { self.or_rival(sightings, &sides, outcome, &mut *pass)? } else { outcome };
             let is_found = outcome.found.is_trusted();
             outcomes.push((bounds, sides, outcome));
@@ -174,7 +176,8 @@ impl<E: From<Error>> Anywhere<'_, E> {
             }
         }
         let mut seconds: f64 = outcomes.iter().map(|(.., outcome)| outcome.found.seconds).sum();
-        if let Some((.., Outcome { shot, found, log })) = outcomes.pop_if(|(.., outcome)| outcome.found.is_trusted()) {
+        let is_all = |(.., outcome): &mut (_, _, Outcome<L>)| outcome.found.is_trusted() || likely == 0;
+        if let Some((.., Outcome { shot, found, log })) = outcomes.pop_if(is_all) {
             return Ok(Some(Outcome { shot, found: Found { seconds, ..found }, log }));
         }
         outcomes.sort_by(|(.., a), (.., b)| a.found.unexplained.total_cmp(&b.found.unexplained));

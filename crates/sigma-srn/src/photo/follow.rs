@@ -182,5 +182,5 @@ impl Follower {
 
 /// What an object covers, in a box.
 pub(super) fn cut_out<E>(bounds: BoundingBox, object: &FoundObject, open: Open<E>) -> Result<Shot, E> {
-    open(bounds, Known { colours: &[], place: Some(&|at| object.shows(at)) })
+    open(bounds, Known { place: Some(&|at| object.shows(at)), ..Known::default() })
 }

@@ -1,17 +1,19 @@
 //! Photographs: from what a camera has taken to what a search compares, and back. What of a photograph is the object is said by a mask or by transparency, or found from
 //! a box around it ([`Boxed`]), in a video from where the object was before ([`Follower`]).
 
+mod all;
 mod boxed;
 mod follow;
 mod shown;
 mod sightings;
 mod template;
 
+pub use all::All;
 pub use boxed::{Anywhere, Boxed, Outcome, Pass, StartsOf};
 pub use follow::{Follower, Looking, Observe, Open};
 pub use shown::FoundObject;
 pub use sightings::{Sighting, Sightings};
-pub use srn_photo::{BoundingBox, Guess, Known, MARGIN, Photo, Pixels, Square};
+pub use srn_photo::{BoundingBox, Guess, Known, MARGIN, Photo, Pixels, Place, Square};
 
 use glam::{DMat4, DQuat, DVec3};
 
@@ -171,9 +173,28 @@ impl Search {
         let open = |bounds, known: Known| in_box(model, instance, photo, bounds, known);
         let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
         let anywhere = Anywhere { engine, model, open: &open, starts: &starts };
-        let found = anywhere.search(&Sightings::of(engine, model, instance, photo.0)?, &mut pass)?;
+        let found = anywhere.search(&Sightings::of(engine, model, instance, photo.0, &[])?, &mut pass)?;
         let nothing = || Error::Input { input: "photograph".into(), what: "nothing in it differs from what is around it".into() };
         found.map(|Outcome { shot, found, .. }| (shot, found)).ok_or_else(nothing)
+    }
+
+    /// All objects of the model that are anywhere in a photograph, with poses to be trusted ([`All`]).
+    pub fn run_for_all(
+        &self,
+        engine: &Engine,
+        model: &Model,
+        photo: (&Photo, &Intrinsics),
+        starts: impl Fn(&Shot) -> Result<Vec<DMat4>, Error>,
+        mut observe: impl FnMut(Progress) -> Result<(), Error>,
+    ) -> Result<Vec<(Shot, Found)>, Error> {
+        let single = self.single()?;
+        let search = |instance: u32, sightings: &Sightings, others: Option<Place>| {
+            let open = |bounds, known: Known| in_box(model, instance, photo, bounds, Known { others, ..known });
+            let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
+            Anywhere { engine, model, open: &open, starts: &starts }.search(sightings, &mut pass)
+        };
+        let found = All { engine, model, photo: photo.0 }.search(0..model.layout.instances, |_| (), search)?;
+        Ok(found.into_iter().map(|Outcome { shot, found, .. }| (shot, found)).collect())
     }
 
     /// Its first try alone.

@@ -6,7 +6,7 @@ use std::iter::zip;
 
 use glam::{DMat4, DVec3, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
-use srn_photo::{Photo, Pixels};
+use srn_photo::{Photo, Pixels, Place};
 use srn_shaders::LinearParams;
 
 use super::template::{Cell, ROLL, ROLLS, SIDE, Template, Templates, WIDER, roll, rolled_view};
@@ -31,6 +31,8 @@ const SUREST: f32 = 5.0;
 const MOST: f32 = 4.0;
 /// Logarithm of the odds beyond the picture's edge.
 const OUTSIDE: f32 = -2.0;
+/// Where less than this speaks for an object it is hardly ever (`docs/tried.md`).
+pub(super) const LIKELY: f32 = 17.0;
 /// A larger thing is less likely to look like the object by chance: the power of its area that counts.
 const AREA: f32 = 0.15;
 
@@ -97,14 +99,16 @@ struct Match {
 }
 
 impl<'a> Sightings<'a> {
-    /// Of an instance of `model`. It is found where its diagonal is an eleventh or more of the photograph's longer side.
-    pub fn of(engine: &'a Engine, model: &'a Model, instance: u32, photo: &Photo) -> Result<Self, Error> {
+    /// Of an instance of `model`. It is found where its diagonal is an eleventh or more of the photograph's longer side, and not where other objects are known to be.
+    pub fn of(engine: &'a Engine, model: &'a Model, instance: u32, photo: &Photo, others: &[FoundObject]) -> Result<Self, Error> {
         let radius = model.metadata.orbit_radius.unwrap_or(1.3);
         let cameras: Vec<DMat4> = around2016(radius).into_iter().step_by(ROLLS).collect();
         let size = photo.size().map(|pixels| pixels as f64);
         let finer = (FINEST / size[0].max(size[1])).min(1.0);
         let [width, height] = size.map(|pixels| (finer * pixels).round().max(1.0) as usize);
-        let looked = Looked::at(photo.pixels().area_resample(width, height));
+        let is_other = |at: [f64; 2]| others.iter().any(|other| other.covers(at.map(|at| at / finer)));
+        let is_other: Option<Place> = if others.is_empty() { None } else { Some(&is_other) };
+        let looked = Looked::at(photo.pixels().area_resample(width, height), is_other);
         let views = views_from(engine, model, instance, &cameras)?;
         let templates = Templates::of(&views);
         let matches = looked.matches(&templates);
@@ -231,6 +235,16 @@ impl<'a> Sightings<'a> {
 }
 
 impl Sighting {
+    /// Whether enough speaks for it that the object may be there.
+    pub fn is_likely(&self) -> bool {
+        self.found.evidence >= LIKELY
+    }
+
+    /// How much speaks for it: more for what is there than for most of what is not, of whichever object.
+    pub fn evidence(&self) -> f32 {
+        self.found.evidence
+    }
+
     fn is_elsewhere(&self, other: &Self) -> bool {
         pose_error(&self.side, &other.side).0 > ELSEWHERE_DEG
     }
@@ -263,14 +277,29 @@ struct Level {
     width: usize,
     height: usize,
     pixels: Vec<Vec4>,
+    /// How much of each pixel is another object; empty where there is none.
+    others: Vec<f32>,
+}
+
+/// What a cell of a template sees.
+enum Seen {
+    /// Nothing, beyond the picture's edge.
+    Outside,
+    /// Another object, which may hide the one that is looked for.
+    Other,
+    /// A colour in [0, 1], and how surprising that is.
+    Pixel(Vec4),
 }
 
 impl Looked {
-    fn at(picture: Pixels) -> Self {
+    /// `is_other`: where another object is, before the one that is looked for or behind it.
+    fn at(picture: Pixels, is_other: Option<Place>) -> Self {
         let Pixels { width, height, data } = picture;
         let colours: Vec<Vec3> = data.chunks_exact(3).map(|c| 0.5 * Vec3::from_slice(c) + 0.5).collect();
         let pixels = zip(&colours, surprises(&colours)).map(|(colour, surprise)| colour.extend(surprise)).collect();
-        let mut levels = vec![Level { width, height, pixels }];
+        let place = |i: usize| [i % width, i / width].map(|at| at as f64 + 0.5);
+        let others = |is_other: Place| (0..colours.len()).map(|i| f32::from(u8::from(is_other(place(i))))).collect();
+        let mut levels = vec![Level { width, height, pixels, others: is_other.map_or(vec![], others) }];
         while let Some(last) = levels.last().filter(|last| last.width.min(last.height) >= 16) {
             levels.push(last.resampled(last.width / 2, last.height / 2));
         }
@@ -343,11 +372,12 @@ impl Looked {
         };
         let seen = |(i, Cell { own, around }): (usize, &Cell)| {
             let is_needed = own.w > 0.0 || around.w > 0.0;
-            is_needed.then(|| level.at([place(i, 0), place(i, 1)])).flatten()
+            if is_needed { level.at([place(i, 0), place(i, 1)]) } else { Seen::Outside }
         };
-        let seen: Vec<Option<Vec4>> = template.cells.iter().enumerate().map(seen).collect();
+        let seen: Vec<Seen> = template.cells.iter().enumerate().map(seen).collect();
         let cells = || zip(&seen, &template.cells);
-        let own = cells().filter_map(|(seen, Cell { own, .. })| Some((seen.as_ref()?, own)));
+        let own =
+            cells().filter_map(|(seen, Cell { own, .. })| if let Seen::Pixel(seen) = seen { Some((seen, own)) } else { None });
         let (both, square) = own.filter(|(_, own)| own.w > 0.0).fold((0.0, 0.0), |(both, square), (seen, own)| {
             (both + seen.xyz().dot(own.xyz()), square + own.xyz().length_squared() / own.w)
         });
@@ -356,14 +386,23 @@ impl Looked {
         let (mut of_own, mut of_around) = (Mean::default(), Mean { weight: 1.0, ..Mean::default() });
         for (seen, Cell { own, around }) in cells() {
             if own.w > 0.0 {
-                of_own.add(own.w, seen.map_or(OUTSIDE, |seen| (seen.w - off(&seen, own)).max(-MOST)));
+                let odds = match seen {
+                    Seen::Outside => OUTSIDE,
+                    Seen::Other => 0.0,
+                    Seen::Pixel(seen) => (seen.w - off(seen, own)).max(-MOST),
+                };
+                of_own.add(own.w, odds);
             }
-            if let Some(seen) = seen.filter(|_| around.w > 0.0) {
-                of_around.add(around.w, off(&seen, around).min(MOST));
+            if let Seen::Pixel(seen) = seen
+                && around.w > 0.0
+            {
+                of_around.add(around.w, off(seen, around).min(MOST));
             }
         }
         let own: f32 = template.cells.iter().map(|cell| cell.own.w).sum();
-        let evidence = (of_own.mean() + of_around.mean()) * (own * cell * cell).powf(AREA);
+        // As if pictures were all as large.
+        let side = cell * FINEST as f32 / self.levels[0].width.max(self.levels[0].height) as f32;
+        let evidence = (of_own.mean() + of_around.mean()) * (own * side * side).powf(AREA);
         Match { evidence, ..found }
     }
 }
@@ -449,33 +488,48 @@ impl Level {
         let (colours, surprises) = (channels(|pixel| pixel.xyz()), channels(|pixel| Vec3::splat(pixel.w)));
         let pixel = |(colour, surprise): (&[f32], &[f32])| Vec3::from_slice(colour).extend(surprise[0]);
         let pixels = zip(colours.chunks_exact(3), surprises.chunks_exact(3)).map(pixel).collect();
-        Level { width, height, pixels }
+        let others = if self.others.is_empty() {
+            vec![]
+        } else {
+            let data = self.others.iter().flat_map(|&other| [other; 3]).collect();
+            let others = Pixels { width: self.width, height: self.height, data }.area_resample(width, height);
+            others.data.into_iter().step_by(3).collect()
+        };
+        Level { width, height, pixels, others }
     }
 
-    /// What is at a place, in pixels from the edge, between pixels; `None` beyond the edge.
-    fn at(&self, place: [f32; 2]) -> Option<Vec4> {
+    /// Whether a pixel is another object's.
+    fn is_other(&self, x: usize, y: usize) -> bool {
+        self.others.get(y * self.width + x).is_some_and(|&other| other > 0.5)
+    }
+
+    /// What is at a place, in pixels from the edge, between pixels.
+    fn at(&self, place: [f32; 2]) -> Seen {
         let ends = [self.width, self.height];
         if (0..2).any(|k| !(0.0..ends[k] as f32).contains(&place[k])) {
-            return None;
+            return Seen::Outside;
+        }
+        if self.is_other(place[0] as usize, place[1] as usize) {
+            return Seen::Other;
         }
         let at = [0, 1].map(|k| (place[k] - 0.5).clamp(0.0, (ends[k] - 1) as f32));
         let ([x, y], [right, below]) = (at.map(|at| at as usize), at.map(f32::fract));
         let pixel = |x: usize, y: usize| self.pixels[y.min(self.height - 1) * self.width + x.min(self.width - 1)];
         let row = |y: usize| pixel(x, y).lerp(pixel(x + 1, y), right);
-        Some(row(y).lerp(row(y + 1), below))
+        Seen::Pixel(row(y).lerp(row(y + 1), below))
     }
 
-    /// With so many pixels more on each side: colours as they are at the edge, which speak against an object.
+    /// With so many pixels more on each side: colours as they are at the edge, which speak against an object, as those of others do.
     fn padded(&self, by: usize) -> Level {
         let [width, height] = [self.width, self.height].map(|side| side + 2 * by);
         let pixel = |i: usize| {
             let at = [i % width, i / width];
             let [x, y] = [0, 1].map(|k| at[k].saturating_sub(by).min([self.width, self.height][k] - 1));
-            let is_inside = [x + by, y + by] == at;
+            let is_inside = [x + by, y + by] == at && !self.is_other(x, y);
             let pixel = self.pixels[y * self.width + x];
             if is_inside { pixel } else { pixel.xyz().extend(OUTSIDE) }
         };
-        Level { width, height, pixels: (0..width * height).map(pixel).collect() }
+        Level { width, height, pixels: (0..width * height).map(pixel).collect(), others: vec![] }
     }
 }
 
@@ -624,7 +678,7 @@ mod tests {
         let of_one_colour = view(|at| object(at).map(|_| [0.7, -0.8, -0.6]));
         let templates = Templates::of(&[of_one_colour, view(object)]);
         for (middle, diagonal, turn) in [([120.0, 90.0], 50.0, 0.4), ([70.0, 100.0], 80.0, 2.9), ([150.0, 60.0], 33.0, -1.5)] {
-            let looked = Looked::at(picture(middle, diagonal, turn));
+            let looked = Looked::at(picture(middle, diagonal, turn), None);
             let found = looked.matches(&templates)[0];
             // From another side, beside it and larger.
             let other = Match { template: 0, roll: 0.0, diagonal: 1.2 * found.diagonal, ..found };
@@ -644,7 +698,7 @@ mod tests {
     fn pictures_of_any_size_and_of_one_colour_have_places_or_none() {
         for [width, height] in [[1, 1], [3, 200], [40, 30]] {
             let pixels = Pixels { width, height, data: vec![0.3; 3 * width * height] };
-            let found = Looked::at(pixels).matches(&Templates::of(&[view(object), view(|_| None)]));
+            let found = Looked::at(pixels, None).matches(&Templates::of(&[view(object), view(|_| None)]));
             assert!(found.iter().all(|found| found.evidence.is_finite()), "{width} × {height}");
         }
     }
