@@ -99,7 +99,7 @@ struct Match {
 }
 
 impl<'a> Sightings<'a> {
-    /// Of an instance of `model`. It is found where its diagonal is an eleventh or more of the photograph's longer side, and not where other objects are known to be.
+    /// Of an instance of `model`. It is found where its diagonal is an eleventh or more of the photograph's longer side, and what `others` cover says nothing.
     pub fn of(engine: &'a Engine, model: &'a Model, instance: u32, photo: &Photo, others: &[FoundObject]) -> Result<Self, Error> {
         let radius = model.metadata.orbit_radius.unwrap_or(1.3);
         let cameras: Vec<DMat4> = around2016(radius).into_iter().step_by(ROLLS).collect();
