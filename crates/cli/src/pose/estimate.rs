@@ -8,7 +8,7 @@ use clap::Args;
 use glam::DMat4;
 use indicatif::ProgressBar;
 use serde::Serialize;
-use sigma_srn::photo::{All, Anywhere, Boxed, Known, Outcome, Place, Shot, Sightings};
+use sigma_srn::photo::{All, Anywhere, Boxed, Known, Outcome, Place, Shot, Sighting, Sightings};
 use sigma_srn::{Confidence, Doubt, Engine, Error, Found, Light, Model, Pose6, Progress, Search};
 use srn_data::camera::Axes;
 use srn_data::target::photo;
@@ -337,19 +337,26 @@ impl Looking<'_> {
         let mut named = |_: &[usize], shots: Vec<Shot>, starts: &[_]| {
             pass(&shots.into_iter().map(|shot| Picture { shot, ..picture.clone() }).collect::<Vec<_>>(), starts)
         };
-        let mut search = |instance: u32, sightings: &Sightings, others: Option<Place>| {
+        let mut search = |instance: u32, sightings: &Sightings, place: Option<Sighting>, others: Option<Place>| {
             let open = |bounds, known: Known| {
                 let (instance, bounds) = (Some(model.instance_name(instance)), Some(Bounds::Box(bounds)));
                 let given = Given { instance, bounds, ..given.clone() };
-                Ok(self.args.open(&given, model, side, Known { others, ..known })?.shot)
+                Ok(self.args.open(&given, model, side, known)?.shot)
             };
-            Anywhere { engine, model, open: &open, starts: &starts }.search(sightings, &mut named)
+            let anywhere = Anywhere { engine, model, open: &open, starts: &starts, others };
+            match place {
+                Some(place) => anywhere.search_at(sightings, place, &mut named),
+                None => anywhere.search(sightings, &mut named),
+            }
         };
         if self.args.is_for_all(given, model) {
-            return All { engine, model, photo: &photo }.search(0..model.layout.instances, look, search);
+            let at = |instance: u32, sightings: &Sightings, place, others: Option<Place>| {
+                search(instance, sightings, Some(place), others)
+            };
+            return All { engine, model, photo: &photo }.search(0..model.layout.instances, look, at);
         }
         let instance = picture.shot.instance;
-        let found = search(instance, &Sightings::of(engine, model, instance, &photo, &[])?, None)?;
+        let found = search(instance, &Sightings::of(engine, model, instance, &photo, &[])?, None, None)?;
         // Where nothing differs from anything, it is the picture as it is.
         match found {
             Some(found) => Ok(vec![found]),

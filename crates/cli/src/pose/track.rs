@@ -292,7 +292,7 @@ fn looked_for(
     };
     let mut pass = |_: &[usize], shots: Vec<Shot>, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut observe)?);
     let sightings = Sightings::of(engine, model, instance, &photo(frame)?, &[])?;
-    let found = Anywhere { engine, model, open, starts }.search(&sightings, &mut pass);
+    let found = Anywhere { engine, model, open, starts, others: None }.search(&sightings, &mut pass);
     bar.finish_and_clear();
     let nothing = || format!("{}: nothing in it looks like {}", frame.display(), model.instance_name(instance));
     let Outcome { shot, found, .. } = found?.ok_or_else(nothing)?;

@@ -3,9 +3,10 @@
 use std::borrow::Borrow;
 
 use glam::{DMat4, DVec2};
-use srn_photo::{BoundingBox, Known};
+use srn_photo::{BoundingBox, Known, Place};
 
 use super::follow::cut_out;
+use super::sightings::LIKELY;
 use super::{FoundObject, Open, Shot, Sighting, Sightings};
 use crate::camera::{fixed24, neighbor4};
 use crate::renderer::render_views;
@@ -148,10 +149,14 @@ pub struct Anywhere<'a, E> {
     pub open: Open<'a, E>,
     /// Where searches start.
     pub starts: &'a dyn Fn(&Shot) -> Result<Vec<DMat4>, E>,
+    /// Where something else is seen, before the object or beside it.
+    pub others: Option<Place<'a>>,
 }
 
 /// So many sides from which it looks more like the object than it does as it was found are tried at a place.
 const RIVALS: usize = 3;
+/// Room around what seems to be the object, likewise, beyond which nothing counts where others of its kind may be.
+const ROOM_ALONE: f64 = 0.05;
 /// So many times as much must speak for a rival that is not to be trusted where the pose is: for a right one it was 1.03 times, for wrong ones it is 1.08 or more (`docs/tried.md`).
 const SURER: f32 = 1.05;
 
@@ -164,14 +169,12 @@ impl<E: From<Error>> Anywhere<'_, E> {
         let places = sightings.likeliest(PLACES);
         let likely = places.iter().filter(|place| place.is_likely()).count();
         for sighting in places.into_iter().take(likely.max(1)) {
-            let sides = sightings.sides(sighting)?;
-            let Some((bounds, outcome)) = self.around(&sides[0], self.starts, &mut *pass)? else { continue };
             // A mask that has something else in it may lead anywhere, but where it is the likeliest the object mostly is.
-            let is_worth_it = outcomes.is_empty() && likely > 0 || outcome.found.is_trusted();
-            let outcome = if is_worth_it { self.or_rival(sightings, &sides, outcome, &mut *pass)? } else { outcome };
-            let is_found = outcome.found.is_trusted();
-            outcomes.push((bounds, sides, outcome));
-            if is_found {
+            let is_likeliest = outcomes.is_empty() && likely > 0;
+            let sides = sightings.sides(sighting)?;
+            let found = self.or_rival_at(sightings, &sides, is_likeliest, &mut *pass)?;
+            outcomes.extend(found.map(|(bounds, outcome)| (bounds, sides, outcome)));
+            if outcomes.last().is_some_and(|(.., outcome)| outcome.found.is_trusted()) {
                 break;
             }
         }
@@ -200,6 +203,48 @@ impl<E: From<Error>> Anywhere<'_, E> {
         }
         best.iter_mut().for_each(|best| best.found.seconds = seconds);
         Ok(best)
+    }
+
+    /// Searches at one place where the object seems to be. Where the pose is not to be trusted, but likely, what is beside the object may be of its kind: then once more, where nothing beyond what it seems to cover
+    /// counts, and once more from there. `None` where nothing at the place differs from what is around it.
+    pub fn search_at<L>(&self, sightings: &Sightings, place: Sighting, pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
+        let sides = sightings.sides(place.clone())?;
+        let Some((_, outcome)) = self.or_rival_at(sightings, &sides, false, &mut *pass)? else { return Ok(None) };
+        let Outcome { shot, found, .. } = &outcome;
+        if found.is_trusted() || sightings.evidence(shot, &found.world_from_camera)? < LIKELY {
+            return Ok(Some(outcome));
+        }
+        let seconds = found.seconds;
+        let alone = self.alone(&place.object, |there| there.or_rival_at(sightings, &sides, false, &mut *pass))?;
+        let Some((bounds, other)) = alone.filter(|(_, other)| other.found.is_trusted()) else { return Ok(Some(outcome)) };
+        // What seemed to be the object is not quite what is.
+        let object = FoundObject::of(&other.shot, &other.found.world_from_camera, self.engine, self.model, 1)?;
+        let anew = self.alone(&object, |there| there.at(bounds, |boxed| boxed.cut_anew(&[0], &[&other], pass)))?;
+        let mut other = anew.into_iter().find(|anew| anew.found.is_trusted()).unwrap_or(other);
+        other.found.seconds += seconds;
+        Ok(Some(other))
+    }
+
+    /// Where nothing beyond an object, and some room around it, counts.
+    fn alone<T>(&self, object: &FoundObject, search: impl FnOnce(&Anywhere<E>) -> T) -> T {
+        let room = object.bounds().map_or(0.0, |bounds| ROOM_ALONE * bounds.size[0].max(bounds.size[1]));
+        let others = |at| self.others.is_some_and(|is_other| is_other(at)) || !object.covers_near(at, room);
+        search(&Anywhere { others: Some(&others), ..*self })
+    }
+
+    /// What is found at a place, in a box there, which comes too, from the likeliest of its sides, or from a rival of what is found so; rivals are tried where that is to be trusted, else if `anyway`. `None` where
+    /// nothing in the box differs from what is around it.
+    fn or_rival_at<L>(
+        &self,
+        sightings: &Sightings,
+        sides: &[Sighting],
+        anyway: bool,
+        pass: Pass<L, E>,
+    ) -> Result<Option<(BoundingBox, Outcome<L>)>, E> {
+        let Some((bounds, outcome)) = self.around(&sides[0], self.starts, &mut *pass)? else { return Ok(None) };
+        let is_worth_it = anyway || outcome.found.is_trusted();
+        let outcome = if is_worth_it { self.or_rival(sightings, sides, outcome, pass)? } else { outcome };
+        Ok(Some((bounds, outcome)))
     }
 
     /// What looks more like the object from other sides is searched for from there, until one has more in the photograph that speaks for it, by [`SURER`] where it is to be trusted less; it counts.
@@ -233,7 +278,7 @@ impl<E: From<Error>> Anywhere<'_, E> {
         pass: Pass<L, E>,
     ) -> Result<Option<(BoundingBox, Outcome<L>)>, E> {
         let bounds = bounds.with_room(ROOM);
-        let Ok(shot) = cut_out(bounds, object, self.open) else { return Ok(None) };
+        let Ok(shot) = cut_out(bounds, object, &|bounds, known| self.cut_out(bounds, known)) else { return Ok(None) };
         let there = Anywhere { starts, ..*self };
         let found = there.at(bounds, |boxed| boxed.in_turns(&[0], vec![shot], pass))?;
         Ok(found.into_iter().next().map(|outcome| (bounds, outcome)))
@@ -241,7 +286,13 @@ impl<E: From<Error>> Anywhere<'_, E> {
 
     /// At one of them.
     fn at<T>(&self, bounds: BoundingBox, search: impl FnOnce(&Boxed<E>) -> T) -> T {
-        let &Anywhere { engine, model, open, starts, .. } = self;
-        search(&Boxed { engine, model, open: &|_, known| open(bounds, known), starts: &|_, shot| starts(shot) })
+        let &Anywhere { engine, model, starts, .. } = self;
+        let open = |_, known: Known| self.cut_out(bounds, known);
+        search(&Boxed { engine, model, open: &open, starts: &|_, shot| starts(shot) })
+    }
+
+    /// The object in a box.
+    fn cut_out(&self, bounds: BoundingBox, known: Known) -> Result<Shot, E> {
+        (self.open)(bounds, Known { others: self.others, ..known })
     }
 }

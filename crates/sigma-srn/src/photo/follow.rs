@@ -166,7 +166,7 @@ impl Follower {
         let Looking { engine, model, search, starts, open, sightings } = *looking;
         let is_it = |found: &Found| found.is_trusted() && found.unexplained <= ABOVE_SURE * unexplained;
         let mut pass = |_: &[usize], shots, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut *observe)?);
-        let found = Anywhere { engine, model, open, starts }.search(&sightings()?, &mut pass)?;
+        let found = Anywhere { engine, model, open, starts, others: None }.search(&sightings()?, &mut pass)?;
         Ok(found.map(|Outcome { shot, found, .. }| (shot, found)).filter(|(_, found)| is_it(found)))
     }
 

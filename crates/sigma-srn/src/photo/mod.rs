@@ -172,7 +172,7 @@ impl Search {
         let single = self.single()?;
         let open = |bounds, known: Known| in_box(model, instance, photo, bounds, known);
         let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
-        let anywhere = Anywhere { engine, model, open: &open, starts: &starts };
+        let anywhere = Anywhere { engine, model, open: &open, starts: &starts, others: None };
         let found = anywhere.search(&Sightings::of(engine, model, instance, photo.0, &[])?, &mut pass)?;
         let nothing = || Error::Input { input: "photograph".into(), what: "nothing in it differs from what is around it".into() };
         found.map(|Outcome { shot, found, .. }| (shot, found)).ok_or_else(nothing)
@@ -188,10 +188,10 @@ impl Search {
         mut observe: impl FnMut(Progress) -> Result<(), Error>,
     ) -> Result<Vec<(Shot, Found)>, Error> {
         let single = self.single()?;
-        let search = |instance: u32, sightings: &Sightings, others: Option<Place>| {
-            let open = |bounds, known: Known| in_box(model, instance, photo, bounds, Known { others, ..known });
+        let search = |instance: u32, sightings: &Sightings, place: Sighting, others: Option<Place>| {
+            let open = |bounds, known: Known| in_box(model, instance, photo, bounds, known);
             let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
-            Anywhere { engine, model, open: &open, starts: &starts }.search(sightings, &mut pass)
+            Anywhere { engine, model, open: &open, starts: &starts, others }.search_at(sightings, place, &mut pass)
         };
         let found = All { engine, model, photo: photo.0 }.search(0..model.layout.instances, |_| (), search)?;
         Ok(found.into_iter().map(|Outcome { shot, found, .. }| (shot, found)).collect())

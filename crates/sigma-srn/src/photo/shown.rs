@@ -65,6 +65,12 @@ impl FoundObject {
         self.silhouette.covers(self.in_view(at))
     }
 
+    /// Whether it covers a place, or one so many pixels off.
+    pub(super) fn covers_near(&self, at: [f64; 2], pixels: f64) -> bool {
+        let off = |k: u32| pixels * (f64::from(k) - 1.0);
+        (0..9).any(|k| self.covers([at[0] + off(k % 3), at[1] + off(k / 3)]))
+    }
+
     /// Whether a place shows it; of white within its outline nobody knows.
     pub fn shows(&self, at: [f64; 2]) -> Option<bool> {
         let at = self.in_view(at);

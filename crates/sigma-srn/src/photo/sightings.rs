@@ -33,6 +33,8 @@ const MOST: f32 = 4.0;
 const OUTSIDE: f32 = -2.0;
 /// Where less than this speaks for an object it is hardly ever (`docs/tried.md`).
 pub(super) const LIKELY: f32 = 17.0;
+/// For a pose that is to be trusted less may speak.
+pub(super) const TOLD: f32 = 16.0;
 /// A larger thing is less likely to look like the object by chance: the power of its area that counts.
 const AREA: f32 = 0.15;
 
@@ -385,24 +387,19 @@ impl Looked {
         let off = |seen: &Vec4, cell: &Vec4| (seen.xyz() - lit * cell.xyz() / cell.w).length_squared() / (2.0 * NOISE * NOISE);
         let (mut of_own, mut of_around) = (Mean::default(), Mean { weight: 1.0, ..Mean::default() });
         for (seen, Cell { own, around }) in cells() {
-            if own.w > 0.0 {
-                let odds = match seen {
-                    Seen::Outside => OUTSIDE,
-                    Seen::Other => 0.0,
-                    Seen::Pixel(seen) => (seen.w - off(seen, own)).max(-MOST),
-                };
-                of_own.add(own.w, odds);
-            }
-            if let Seen::Pixel(seen) = seen
-                && around.w > 0.0
-            {
-                of_around.add(around.w, off(seen, around).min(MOST));
+            match seen {
+                // It is as if an object had no more than is in sight.
+                Seen::Other => {}
+                Seen::Outside => of_own.add(own.w, || OUTSIDE),
+                Seen::Pixel(seen) => {
+                    of_own.add(own.w, || (seen.w - off(seen, own)).max(-MOST));
+                    of_around.add(around.w, || off(seen, around).min(MOST));
+                }
             }
         }
-        let own: f32 = template.cells.iter().map(|cell| cell.own.w).sum();
         // As if pictures were all as large.
         let side = cell * FINEST as f32 / self.levels[0].width.max(self.levels[0].height) as f32;
-        let evidence = (of_own.mean() + of_around.mean()) * (own * side * side).powf(AREA);
+        let evidence = (of_own.mean() + of_around.mean()) * (of_own.weight * side * side).powf(AREA);
         Match { evidence, ..found }
     }
 }
@@ -419,8 +416,10 @@ struct Mean {
 }
 
 impl Mean {
-    fn add(&mut self, weight: f32, value: f32) {
-        (self.sum, self.weight) = (self.sum + weight * value, self.weight + weight);
+    fn add(&mut self, weight: f32, value: impl FnOnce() -> f32) {
+        if weight > 0.0 {
+            (self.sum, self.weight) = (self.sum + weight * value(), self.weight + weight);
+        }
     }
 
     fn mean(&self) -> f32 {
@@ -692,6 +691,24 @@ mod tests {
                 assert!((0.9..1.12).contains(&larger) && turned < 0.2, "{middle:?}: {larger} {turned}");
             }
         }
+    }
+
+    /// Of an object of which a third is behind something grey, as much speaks for it as for what is left of it, where that is known; else less.
+    #[test]
+    fn what_hides_an_object_says_nothing() {
+        let (middle, diagonal, template) = ([120.0, 90.0], 50.0, Template::of(&view(object)));
+        let is_hidden = |at: [f64; 2]| at[0] > middle[0] + 0.1 * diagonal;
+        let mut hidden = picture(middle, diagonal, 0.0);
+        let hides = |i: usize| is_hidden([i % SIDE_OF_PICTURE[0], i / SIDE_OF_PICTURE[0]].map(|at| at as f64 + 0.5));
+        (0..hidden.data.len()).filter(|k| hides(k / 3)).for_each(|k| hidden.data[k] = -0.05);
+        let evidence = |picture: Pixels, is_other: Option<Place>| {
+            let middle = middle.map(|at| at as f32);
+            let at = Match { middle, diagonal: diagonal as f32, template: 0, roll: 0.0, evidence: 0.0 };
+            Looked::at(picture, is_other).judged(at, &template).evidence
+        };
+        let all = evidence(picture(middle, diagonal, 0.0), None);
+        let [known, unknown] = [Some(&is_hidden as Place), None].map(|is_other| evidence(hidden.clone(), is_other));
+        assert!(known > 0.9 * all && unknown < 0.75 * all, "{all} {known} {unknown}");
     }
 
     #[test]
