@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
-use sigma_srn::photo::{BoundingBox, FoundObject, Photo, Shot, Sightings};
-use sigma_srn::{Effort, Engine, Error, Found, Intrinsics, Model, Search, camera};
+use glam::{DMat4, DVec3};
+use sigma_srn::photo::{Anywhere, BoundingBox, FoundObject, Known, Outcome, Photo, Shot, Sightings};
+use sigma_srn::{Doubt, Effort, Engine, Error, Found, Intrinsics, Model, Search, camera};
 
 /// Of the pictures in `assets/scenes`.
 const INTRINSICS: Intrinsics = Intrinsics { fx: 297.6, fy: 297.6, cx: 128.0, cy: 128.0, pixel_center: 0.0 };
@@ -59,20 +60,32 @@ fn an_object_is_found_anywhere() {
     let (angle, distance) = camera::pose_error(&found.world_from_camera, &truth);
     assert!(angle < 0.6 && distance < 0.015 && found.is_trusted(), "{angle} {distance} {:?}", found.doubt);
     // The side that was sighted is turned towards the right one.
-    let facing = |side: &glam::DMat4| shot.facing(&model, side).unwrap();
-    let off = |side: &glam::DMat4| camera::pose_error(&facing(side), &facing(&truth)).0;
+    let facing = |side: &DMat4| shot.facing(&model, side).unwrap();
+    let off = |side: &DMat4| camera::pose_error(&facing(side), &facing(&truth)).0;
     let sides = sightings.sides(first.clone()).unwrap();
     let [sighted, turned] = [&first, &sides[0]].map(|sighting| off(&sighting.side));
     assert!(turned < 0.9 * sighted, "{sighted} {turned}");
     // Less speaks for wrong poses, and something else for a better one: next to it, or all around the object from it.
-    let evidence = |pose: &glam::DMat4| sightings.evidence(&shot, pose).unwrap();
+    let evidence = |pose: &DMat4| sightings.evidence(&shot, pose).unwrap();
     for degrees in [12.0f64, -70.0, 180.0] {
-        let wrong = glam::DMat4::from_rotation_z(degrees.to_radians()) * truth;
+        let wrong = DMat4::from_rotation_z(degrees.to_radians()) * truth;
         assert!(evidence(&wrong) < 0.97 * evidence(&truth), "{degrees}: {} of {}", evidence(&wrong), evidence(&truth));
         let rival = sightings.rivals(&shot, &wrong, &sides).unwrap().remove(0);
         let [before, after] = [&wrong, &rival.side].map(off);
         assert!(after < before.min(40.0), "{degrees}: {before} {after}");
     }
+    // However much of a picture a pose explains, it is not to be trusted where the photograph shows the object elsewhere.
+    let aside = Found { world_from_camera: truth * DMat4::from_translation(DVec3::new(0.4, 0.0, 0.0)), ..found };
+    let open = |bounds, known: Known| {
+        let shot = Shot::in_box((&photo, &INTRINSICS), bounds, known, instance, 64);
+        shot.ok_or_else(|| Error::Input { input: "box".into(), what: "empty".into() })
+    };
+    let mut pass = |_: &[usize], shots: Vec<Shot>, _: &[_]| {
+        Ok::<_, Error>(shots.into_iter().map(|shot| Outcome { shot, found: aside.clone(), log: () }).collect())
+    };
+    let anywhere = Anywhere { engine: &engine, model: &model, open: &open, starts: &|_| Ok(vec![]), others: None };
+    let told = anywhere.search(&sightings, &mut pass).unwrap().unwrap().found;
+    assert_eq!((aside.doubt, told.doubt), (None, Some(Doubt::Unlikely)));
     let grey = Photo::from_rgba8(64, 48, &[120, 130, 140, 255].repeat(64 * 48)).unwrap();
     let nothing = search.run_anywhere(&engine, &model, instance, (&grey, &INTRINSICS), starts, |_| Ok(()));
     let said = nothing.map(|(_, found)| found.is_trusted());
@@ -97,13 +110,13 @@ fn all_objects_of_a_model_are_found_that_are_there() {
     let truth = |line: &str| {
         let (name, rows) = line.split_once(' ').unwrap();
         let rows: Vec<f64> = rows.split(' ').map(|number| number.parse().unwrap()).collect();
-        model.instance(name).ok().map(|instance| (instance, glam::DMat4::from_cols_slice(&rows).transpose()))
+        model.instance(name).ok().map(|instance| (instance, DMat4::from_cols_slice(&rows).transpose()))
     };
-    let mut truths: Vec<(u32, glam::DMat4)> = truths.lines().filter_map(truth).collect();
+    let mut truths: Vec<(u32, DMat4)> = truths.lines().filter_map(truth).collect();
     assert_eq!((found.len(), truths.len()), (3, 3));
     for (shot, found) in found {
-        let off = |truth: &glam::DMat4| camera::pose_error(&found.world_from_camera, truth);
-        let is_it = |(instance, truth): &(u32, glam::DMat4)| *instance == shot.instance && off(truth).0 < 5.0;
+        let off = |truth: &DMat4| camera::pose_error(&found.world_from_camera, truth);
+        let is_it = |(instance, truth): &(u32, DMat4)| *instance == shot.instance && off(truth).0 < 5.0;
         let (_, truth) = truths.remove(truths.iter().position(is_it).unwrap());
         assert!(found.is_trusted() && off(&truth).1 < 0.15, "{:?}", off(&truth));
     }

@@ -27,7 +27,7 @@ use crate::video::Video;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
-const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [rooms] [several] [others] [sides] [video] [leaving] [captures] [--seed N] [--starts STARTS]";
+const USAGE: &str = "usage: robustness [distance] [rolled] [near] [light] [masks] [alone] [hidden] [boxes] [rooms] [several] [behind] [others] [sides] [video] [leaving] [captures] [--seed N] [--starts STARTS]";
 
 const OUT: &str = "demo/robustness";
 const MODEL: &str = "assets/models/compact.safetensors";
@@ -205,7 +205,7 @@ fn main() -> ExitCode {
 
 fn run() -> Result<()> {
     let (mut wanted, mut has_sides, mut has_video, mut has_captures) = (Vec::new(), false, false, false);
-    let (mut has_leaving, mut has_several) = (false, false);
+    let (mut has_leaving, mut has_several, mut has_behind) = (false, false, false);
     let (mut seed, mut starts) = (23, "around2016".to_string());
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
@@ -216,22 +216,20 @@ fn run() -> Result<()> {
             "video" => has_video = true,
             "leaving" => has_leaving = true,
             "several" => has_several = true,
+            "behind" => has_behind = true,
             "captures" => has_captures = true,
             name => wanted.push(TABLES.iter().find(|table| table.name == name).ok_or(USAGE)?),
         }
     }
-    if wanted.is_empty() && ![has_several, has_sides, has_video, has_leaving, has_captures].contains(&true) {
-        (wanted, has_several) = (TABLES.iter().collect(), true);
+    if wanted.is_empty() && ![has_several, has_behind, has_sides, has_video, has_leaving, has_captures].contains(&true) {
+        (wanted, has_several, has_behind) = (TABLES.iter().collect(), true, true);
         (has_sides, has_video, has_leaving, has_captures) = (true, true, true, true);
     }
     let programs = Programs { folder: std::env::current_exe()?.parent().ok_or("no folder")?.into(), starts };
     let mut shown = Vec::new();
     for table in wanted {
         println!("\n{}, seed {seed}, {} pictures each, made in {OUT}\n", table.name, VIEWS * OBJECTS.len());
-        println!(
-            "| | starts | effort | rotation, mean / median / worst | translation, mean / median | more than 5° off | trusted, of these wrong | \
-             truth in the stated 95 %, of these |\n|---|---|---|---|---|---|---|---|"
-        );
+        println!("{HEAD}");
         for row in table.rows {
             let views = programs.views(row, seed)?;
             let folder = Path::new(OUT).join(table.name).join(row.what.replace([' ', ',', '°', '/'], "-"));
@@ -262,6 +260,9 @@ fn run() -> Result<()> {
     if has_several {
         several(&programs, seed)?;
     }
+    if has_behind {
+        behind(&programs, seed)?;
+    }
     if has_sides {
         sides(&programs, seed)?;
     }
@@ -289,10 +290,21 @@ fn several(programs: &Programs, seed: u64) -> Result<()> {
         "| | effort | found within 5°, of those half in sight | told, of these wrong | rotation, mean / median / worst | \
          translation, mean / median | a picture, median |\n|---|---|---|---|---|---|---|"
     );
-    let views = programs.views(&in_room("several", 3.0, Spoil::Nothing), seed)?;
-    let rooms = |lying| several::rooms(lying, &views, &mut Pcg64Mcg::seed_from_u64(seed));
-    for (what, rooms) in [("beside each other", rooms(Lying::Apart)?), ("in a heap", rooms(Lying::Heaped)?)] {
-        println!("{}", several::found(programs, rooms, what, "fast")?);
+    for (what, lying) in [("beside each other", Lying::Apart), ("in a heap", Lying::Heaped)] {
+        println!("{}", several::found(programs, several::rooms(programs, lying, seed)?, what, "fast")?);
+    }
+    Ok(())
+}
+
+/// The table of objects behind others in heaps, by boxes around what is in sight of them.
+fn behind(programs: &Programs, seed: u64) -> Result<()> {
+    println!("\nbehind, seed {seed}, made in {OUT}\n{HEAD}");
+    let rooms = several::rooms(programs, Lying::Heaped, seed)?;
+    for (what, in_sight) in [("3 to 5 tenths in sight", 0.3..0.5), ("5 to 7 tenths", 0.5..0.7), ("7 to 9.7 tenths", 0.7..0.97)] {
+        let pictures = several::boxed(&rooms, &in_sight)?;
+        let found = pictures.iter().map(|(name, picture)| programs.found(name, AROUND_FAST, picture));
+        let found = found.collect::<Result<Vec<_>>>()?;
+        println!("| {what}, {} pictures | {} |", found.len(), line(AROUND_FAST, &found));
     }
     Ok(())
 }
@@ -437,34 +449,34 @@ impl Programs {
         } else {
             object
         };
-        let mut found = Vec::new();
-        for picture in pictures {
-            let mut estimate = self.command("sigma-pose");
-            estimate.args(["estimate", "--json", "--executor", "cpu", "--model", MODEL, "--effort", how.effort]);
-            estimate.args(["--instance", OBJECTS[claimed % OBJECTS.len()].0]);
-            estimate.arg(&picture.picture).arg("--intrinsics").arg(&picture.intrinsics).arg("--truth").arg(&picture.truth);
-            match how.rough {
-                true => estimate.arg("--rough").arg(&picture.truth),
-                false => estimate.arg("--starts").arg(&self.starts),
-            };
-            if let Some(mask) = &picture.mask {
-                estimate.arg("--mask").arg(mask);
-            }
-            if let Some(bounds) = &picture.bounds {
-                estimate.arg(format!("--box={bounds}"));
-            }
-            let output = estimate.output()?;
-            let report: Value = serde_json::from_slice(&output.stdout).map_err(|_| said(&output))?;
-            let of_picture = &report["images"][0];
-            let number = |value: &Value| value.as_f64().ok_or("sigma-pose printed no number");
-            found.push(Found {
-                rotation_deg: number(&of_picture["error"]["rotation_deg"])?,
-                translation_percent: number(&of_picture["error"]["translation_percent"])?,
-                is_trusted: of_picture["trusted"] == true,
-                within_95: of_picture["within_95"] == true,
-            });
+        pictures.iter().map(|picture| self.found(OBJECTS[claimed % OBJECTS.len()].0, how, picture)).collect()
+    }
+
+    /// What it finds of an object that is said to be in a picture.
+    fn found(&self, name: &str, how: How, picture: &Picture) -> Result<Found> {
+        let mut estimate = self.command("sigma-pose");
+        estimate.args(["estimate", "--json", "--executor", "cpu", "--model", MODEL, "--effort", how.effort, "--instance", name]);
+        estimate.arg(&picture.picture).arg("--intrinsics").arg(&picture.intrinsics).arg("--truth").arg(&picture.truth);
+        match how.rough {
+            true => estimate.arg("--rough").arg(&picture.truth),
+            false => estimate.arg("--starts").arg(&self.starts),
+        };
+        if let Some(mask) = &picture.mask {
+            estimate.arg("--mask").arg(mask);
         }
-        Ok(found)
+        if let Some(bounds) = &picture.bounds {
+            estimate.arg(format!("--box={bounds}"));
+        }
+        let output = estimate.output()?;
+        let report: Value = serde_json::from_slice(&output.stdout).map_err(|_| said(&output))?;
+        let of_picture = &report["images"][0];
+        let number = |value: &Value| value.as_f64().ok_or("sigma-pose printed no number");
+        Ok(Found {
+            rotation_deg: number(&of_picture["error"]["rotation_deg"])?,
+            translation_percent: number(&of_picture["error"]["translation_percent"])?,
+            is_trusted: of_picture["trusted"] == true,
+            within_95: of_picture["within_95"] == true,
+        })
     }
 }
 
@@ -481,6 +493,12 @@ fn mean(values: &[f64]) -> f64 {
 fn median(values: &[f64]) -> f64 {
     0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2])
 }
+
+/// Above the lines of most tables.
+const HEAD: &str = "\
+| | starts | effort | rotation, mean / median / worst | translation, mean / median | more than 5° off | trusted, of these wrong | \
+truth in the stated 95 %, of these |
+|---|---|---|---|---|---|---|---|";
 
 /// The cells of a table.
 fn line(how: How, found: &[Found]) -> String {

@@ -1,19 +1,21 @@
 //! Rooms with several objects of the model, of which nobody says which they are, nor where.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use glam::DMat4;
 use image::{Rgb, RgbImage};
-use rand::RngExt;
 use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde_json::Value;
 use sigma_srn::camera::pose_error;
 use srn_data::srn;
 
+use crate::photo::Spoil;
 use crate::scene::{self, SIZE};
-use crate::{FOCAL_OF_ROOM, MODEL, OBJECTS, OUT, Programs, Result, VIEWS, mean, median, said};
+use crate::{FOCAL_OF_ROOM, MODEL, OBJECTS, OUT, Picture, Programs, Result, VIEWS, in_room, mean, median, said};
 
 /// Rooms in all, and objects in each, beside each other in so many columns.
 const ROOMS: usize = 12;
@@ -48,12 +50,15 @@ pub struct Room {
 struct Object {
     name: &'static str,
     world_from_camera: DMat4,
-    /// How much of it is.
+    /// How much of it is in sight, and left edge, top edge, width and height of a box around that.
     in_sight: f64,
+    bounds: [u32; 4],
 }
 
-/// Objects of `views` in rooms.
-pub fn rooms(lying: Lying, views: &Path, random: &mut Pcg64Mcg) -> Result<Vec<Room>> {
+/// Objects in rooms.
+pub fn rooms(programs: &Programs, lying: Lying, seed: u64) -> Result<Vec<Room>> {
+    let views = programs.views(&in_room("several", 3.0, Spoil::Nothing), seed)?;
+    let random = &mut Pcg64Mcg::seed_from_u64(seed);
     let folder = Path::new(OUT).join(if lying == Lying::Apart { "several" } else { "heaped" });
     std::fs::create_dir_all(&folder)?;
     let room = |number: usize| {
@@ -84,8 +89,14 @@ pub fn rooms(lying: Lying, views: &Path, random: &mut Pcg64Mcg) -> Result<Vec<Ro
             objects.push((name, world_from_camera, own().count()));
         }
         let in_sight = |(place, (name, world_from_camera, pixels)): (u32, (_, _, usize))| {
-            let seen = owners.iter().filter(|owner| **owner == Some(place)).count();
-            Object { name, world_from_camera, in_sight: seen as f64 / pixels as f64 }
+            let is_seen = |(i, owner): (u32, &Option<u32>)| (*owner == Some(place)).then_some([i % SIZE[0], i / SIZE[0]]);
+            let seen: Vec<[u32; 2]> = (0..).zip(&owners).filter_map(is_seen).collect();
+            let ends = [0, 1].map(|k| {
+                let along = || seen.iter().map(|at| at[k]);
+                [along().min().unwrap_or(0), along().max().map_or(0, |last| last + 1)]
+            });
+            let bounds = [ends[0][0], ends[1][0], ends[0][1] - ends[0][0], ends[1][1] - ends[1][0]];
+            Object { name, world_from_camera, in_sight: seen.len() as f64 / pixels as f64, bounds }
         };
         let objects: Vec<Object> = (0..).zip(objects).map(in_sight).collect();
         let path = folder.join(format!("{number}.png"));
@@ -98,6 +109,28 @@ pub fn rooms(lying: Lying, views: &Path, random: &mut Pcg64Mcg) -> Result<Vec<Ro
         Ok(Room { picture: path, objects })
     };
     (0..ROOMS).map(room).collect()
+}
+
+/// Those of which so much is in sight, with boxes around that.
+pub fn boxed(rooms: &[Room], in_sight: &Range<f64>) -> Result<Vec<(&'static str, Picture)>> {
+    let mut pictures = Vec::new();
+    for Room { picture, objects } in rooms {
+        let intrinsics = picture.with_extension("intrinsics");
+        let [width, height] = SIZE;
+        let lines = format!("{FOCAL_OF_ROOM} {} {} 0.\n0. 0. 0.\n1.\n{height} {width}\n", width / 2, height / 2);
+        std::fs::write(&intrinsics, lines)?;
+        for (number, object) in objects.iter().enumerate().filter(|(_, object)| in_sight.contains(&object.in_sight)) {
+            let truth = picture.with_extension(format!("{number}.pose"));
+            std::fs::write(
+                &truth,
+                object.world_from_camera.transpose().to_cols_array().map(|value| value.to_string()).join(" "),
+            )?;
+            let bounds = Some(object.bounds.map(|pixels| pixels.to_string()).join(","));
+            let (picture, intrinsics) = (picture.clone(), intrinsics.clone());
+            pictures.push((object.name, Picture { picture, mask: None, bounds, intrinsics, truth }));
+        }
+    }
+    Ok(pictures)
 }
 
 /// Looks for all objects in all rooms; a line of a table.

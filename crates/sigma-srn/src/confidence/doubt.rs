@@ -26,6 +26,8 @@ pub enum Doubt {
     /// It explains the picture by much of the object lying where the picture does not count, and of what is in sight neither its outline nor its colours
     /// tell: many poses are right.
     Hidden,
+    /// Too little in the photograph in which it was looked for speaks for the object there, see [`Sightings::evidence`](crate::photo::Sightings::evidence).
+    Unlikely,
 }
 
 impl std::fmt::Display for Doubt {
@@ -37,6 +39,7 @@ impl std::fmt::Display for Doubt {
             Doubt::Small => "too small in the picture",
             Doubt::Rival => "another pose does nearly as well",
             Doubt::Hidden => "too much of the object lies behind the mask, and what is in sight does not tell",
+            Doubt::Unlikely => "too little in the photograph speaks for it",
         })
     }
 }

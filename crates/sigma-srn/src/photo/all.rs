@@ -2,7 +2,6 @@
 
 use srn_photo::{BoundingBox, Photo, Place};
 
-use super::sightings::TOLD;
 use super::{FoundObject, Outcome, Sighting, Sightings};
 use crate::{Engine, Error, Found, Model};
 
@@ -69,7 +68,7 @@ impl All<'_> {
             let is_other = |at| objects.iter().any(|other: &FoundObject| other.covers(at));
             let others: Option<Place> = if objects.is_empty() { None } else { Some(&is_other) };
             let found = search(instance, &sightings, place.clone(), others)?;
-            let Some((outcome, object, bounds)) = self.to_be_told(found, &sightings, &objects)? else {
+            let Some((outcome, object, bounds)) = self.to_be_told(found, &objects)? else {
                 lost.push(Lost { instance, place });
                 continue;
             };
@@ -83,19 +82,17 @@ impl All<'_> {
         Ok(taken)
     }
 
-    /// What was found, what it covers, and a box around that; `None` where it is not to be trusted, too little speaks for it, or it is one of these objects.
+    /// What was found, what it covers, and a box around that; `None` where it is not to be trusted, or is one of these objects.
     fn to_be_told<L>(
         &self,
         found: Option<Outcome<L>>,
-        sightings: &Sightings,
         objects: &[FoundObject],
     ) -> Result<Option<(Outcome<L>, FoundObject, BoundingBox)>, Error> {
         let Some(outcome) = found.filter(|outcome| outcome.found.is_trusted()) else { return Ok(None) };
         let Outcome { shot, found: Found { world_from_camera, .. }, .. } = &outcome;
         let object = FoundObject::of(shot, world_from_camera, self.engine, self.model, 1)?;
         let is_new = objects.iter().all(|other| other.overlap(&object) < SAME);
-        let is_told = is_new && sightings.evidence(shot, world_from_camera)? >= TOLD;
-        Ok(object.bounds().filter(|_| is_told).map(|bounds| (outcome, object, bounds)))
+        Ok(object.bounds().filter(|_| is_new).map(|bounds| (outcome, object, bounds)))
     }
 }
 

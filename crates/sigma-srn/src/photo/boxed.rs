@@ -6,11 +6,11 @@ use glam::{DMat4, DVec2};
 use srn_photo::{BoundingBox, Known, Place};
 
 use super::follow::cut_out;
-use super::sightings::LIKELY;
+use super::sightings::{LIKELY, TOLD};
 use super::{FoundObject, Open, Shot, Sighting, Sightings};
 use crate::camera::{fixed24, neighbor4};
 use crate::renderer::render_views;
-use crate::{Engine, Error, Found, Intrinsics, Model, Outline, View};
+use crate::{Doubt, Engine, Error, Found, Intrinsics, Model, Outline, View};
 
 /// The model's object is looked at in pictures of so many pixels, for its colours.
 const SIDE: u32 = 32;
@@ -162,7 +162,7 @@ const SURER: f32 = 1.05;
 
 impl<E: From<Error>> Anywhere<'_, E> {
     /// Searches at the places where the object seems to be, the likeliest first, from the likeliest of the [`Sightings::sides`] there, until a pose is to be trusted, and nothing that looks more like the
-    /// object ([`Sightings::rivals`]) leads to a better one; if none is, once more by the colours of the model's object, first where the least is left unexplained; then the least counts. Where it hardly is
+    /// object ([`Sightings::rivals`]) leads to a better one; if none is, once more by the colours of the model's object, and alone, first where the least is left unexplained; then the least counts. Where it hardly is
     /// ([`Sighting::is_likely`]) it is searched for once, at the likeliest place. `None` where no place differs from what is around it.
     pub fn search<L>(&self, sightings: &Sightings, pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
         let mut outcomes = Vec::new();
@@ -171,26 +171,29 @@ impl<E: From<Error>> Anywhere<'_, E> {
         for sighting in places.into_iter().take(likely.max(1)) {
             // A mask that has something else in it may lead anywhere, but where it is the likeliest the object mostly is.
             let is_likeliest = outcomes.is_empty() && likely > 0;
-            let sides = sightings.sides(sighting)?;
+            let sides = sightings.sides(sighting.clone())?;
             let found = self.or_rival_at(sightings, &sides, is_likeliest, &mut *pass)?;
-            outcomes.extend(found.map(|(bounds, outcome)| (bounds, sides, outcome)));
+            outcomes.extend(found.map(|(bounds, outcome)| (bounds, sighting.object, sides, outcome)));
             if outcomes.last().is_some_and(|(.., outcome)| outcome.found.is_trusted()) {
                 break;
             }
         }
         let mut seconds: f64 = outcomes.iter().map(|(.., outcome)| outcome.found.seconds).sum();
-        let is_all = |(.., outcome): &mut (_, _, Outcome<L>)| outcome.found.is_trusted() || likely == 0;
+        let is_all = |(.., outcome): &mut (_, _, _, Outcome<L>)| outcome.found.is_trusted() || likely == 0;
         if let Some((.., Outcome { shot, found, log })) = outcomes.pop_if(is_all) {
             return Ok(Some(Outcome { shot, found: Found { seconds, ..found }, log }));
         }
         outcomes.sort_by(|(.., a), (.., b)| a.found.unexplained.total_cmp(&b.found.unexplained));
         let mut best = None::<Outcome<L>>;
-        for (bounds, sides, outcome) in outcomes {
+        for (bounds, sighted, sides, outcome) in outcomes {
             seconds -= outcome.found.seconds;
             let wider = bounds.with_room(ROOM_BY_COLOURS);
             for outcome in self.at(wider, |boxed| boxed.by_colours(&[0], vec![outcome], &mut *pass))? {
-                let is_found = outcome.found.is_trusted();
-                let outcome = if is_found { self.or_rival(sightings, &sides, outcome, &mut *pass)? } else { outcome };
+                let outcome = if outcome.found.is_trusted() {
+                    doubted(sightings, self.or_rival(sightings, &sides, outcome, &mut *pass)?)?
+                } else {
+                    self.or_alone(sightings, &sighted, &sides, outcome, &mut *pass)?
+                };
                 let Outcome { found, .. } = &outcome;
                 seconds += found.seconds;
                 if found.is_trusted() || best.as_ref().is_none_or(|best| found.unexplained < best.found.unexplained) {
@@ -205,24 +208,40 @@ impl<E: From<Error>> Anywhere<'_, E> {
         Ok(best)
     }
 
-    /// Searches at one place where the object seems to be. Where the pose is not to be trusted, but likely, what is beside the object may be of its kind: then once more, where nothing beyond what it seems to cover
-    /// counts, and once more from there. `None` where nothing at the place differs from what is around it.
+    /// Searches at one place where the object seems to be, and where its pose is not to be trusted alone. `None` where nothing at the place differs from what is around it.
     pub fn search_at<L>(&self, sightings: &Sightings, place: Sighting, pass: Pass<L, E>) -> Result<Option<Outcome<L>>, E> {
         let sides = sightings.sides(place.clone())?;
         let Some((_, outcome)) = self.or_rival_at(sightings, &sides, false, &mut *pass)? else { return Ok(None) };
-        let Outcome { shot, found, .. } = &outcome;
-        if found.is_trusted() || sightings.evidence(shot, &found.world_from_camera)? < LIKELY {
-            return Ok(Some(outcome));
+        let is_found = outcome.found.is_trusted();
+        let outcome = if is_found { outcome } else { self.or_alone(sightings, &place.object, &sides, outcome, pass)? };
+        Ok(Some(outcome))
+    }
+
+    /// Where a pose is not to be trusted, but likely, what is beside the object may be of its kind: then once more at the place, where nothing beyond what was sighted counts, and once more from there; what is to be
+    /// trusted then counts.
+    fn or_alone<L>(
+        &self,
+        sightings: &Sightings,
+        sighted: &FoundObject,
+        sides: &[Sighting],
+        mut outcome: Outcome<L>,
+        pass: Pass<L, E>,
+    ) -> Result<Outcome<L>, E> {
+        if sightings.evidence(&outcome.shot, &outcome.found.world_from_camera)? < LIKELY {
+            return Ok(outcome);
         }
-        let seconds = found.seconds;
-        let alone = self.alone(&place.object, |there| there.or_rival_at(sightings, &sides, false, &mut *pass))?;
-        let Some((bounds, other)) = alone.filter(|(_, other)| other.found.is_trusted()) else { return Ok(Some(outcome)) };
-        // What seemed to be the object is not quite what is.
-        let object = FoundObject::of(&other.shot, &other.found.world_from_camera, self.engine, self.model, 1)?;
-        let anew = self.alone(&object, |there| there.at(bounds, |boxed| boxed.cut_anew(&[0], &[&other], pass)))?;
-        let mut other = anew.into_iter().find(|anew| anew.found.is_trusted()).unwrap_or(other);
-        other.found.seconds += seconds;
-        Ok(Some(other))
+        let alone = self.alone(sighted, |there| there.or_rival_at(sightings, sides, false, &mut *pass))?;
+        let Some((bounds, mut other)) = alone else { return Ok(outcome) };
+        if other.found.is_trusted() {
+            // What seemed to be the object is not quite what is.
+            let object = FoundObject::of(&other.shot, &other.found.world_from_camera, self.engine, self.model, 1)?;
+            let anew = self.alone(&object, |there| there.at(bounds, |boxed| boxed.cut_anew(&[0], &[&other], pass)))?;
+            let anew = anew.into_iter().map(|anew| doubted(sightings, anew)).collect::<Result<Vec<_>, E>>()?;
+            other = anew.into_iter().find(|anew| anew.found.is_trusted()).unwrap_or(other);
+            std::mem::swap(&mut outcome, &mut other);
+        }
+        outcome.found.seconds += other.found.seconds;
+        Ok(outcome)
     }
 
     /// Where nothing beyond an object, and some room around it, counts.
@@ -244,7 +263,7 @@ impl<E: From<Error>> Anywhere<'_, E> {
         let Some((bounds, outcome)) = self.around(&sides[0], self.starts, &mut *pass)? else { return Ok(None) };
         let is_worth_it = anyway || outcome.found.is_trusted();
         let outcome = if is_worth_it { self.or_rival(sightings, sides, outcome, pass)? } else { outcome };
-        Ok(Some((bounds, outcome)))
+        Ok(Some((bounds, doubted(sightings, outcome)?)))
     }
 
     /// What looks more like the object from other sides is searched for from there, until one has more in the photograph that speaks for it, by [`SURER`] where it is to be trusted less; it counts.
@@ -295,4 +314,13 @@ impl<E: From<Error>> Anywhere<'_, E> {
     fn cut_out(&self, bounds: BoundingBox, known: Known) -> Result<Shot, E> {
         (self.open)(bounds, Known { others: self.others, ..known })
     }
+}
+
+/// Not to be trusted where too little in the photograph speaks for it.
+fn doubted<L, E: From<Error>>(sightings: &Sightings, mut outcome: Outcome<L>) -> Result<Outcome<L>, E> {
+    let Outcome { shot, found, .. } = &outcome;
+    if found.is_trusted() && sightings.evidence(shot, &found.world_from_camera)? < TOLD {
+        outcome.found.doubt = Some(Doubt::Unlikely);
+    }
+    Ok(outcome)
 }

@@ -33,7 +33,7 @@ const MOST: f32 = 4.0;
 const OUTSIDE: f32 = -2.0;
 /// Where less than this speaks for an object it is hardly ever (`docs/tried.md`).
 pub(super) const LIKELY: f32 = 17.0;
-/// For a pose that is to be trusted less may speak.
+/// Where less speaks for a pose that was found it is not to be trusted.
 pub(super) const TOLD: f32 = 16.0;
 /// A larger thing is less likely to look like the object by chance: the power of its area that counts.
 const AREA: f32 = 0.15;
