@@ -585,10 +585,8 @@ fn in_a_room(
     random: &mut Pcg64Mcg,
 ) -> Result<Picture> {
     let (picture, turn) = scene::room(object, others, random)?;
-    let [width, height] = scene::SIZE;
     picture.save(path(".png"))?;
-    std::fs::write(path(".txt"), format!("{} {} {} 0.\n0. 0. 0.\n1.\n{height} {width}\n", row.focal, width / 2, height / 2))?;
-    let rows = (srn::read_pose(pose)? * DMat4::from_mat3(turn)).transpose().to_cols_array().map(|value| value.to_string());
-    std::fs::write(path(".pose"), rows.join(" "))?;
+    std::fs::write(path(".txt"), scene::intrinsics(row.focal))?;
+    std::fs::write(path(".pose"), scene::pose(&(srn::read_pose(pose)? * DMat4::from_mat3(turn))))?;
     Ok(Picture { picture: path(".png"), mask: None, bounds: Some("auto".into()), intrinsics: path(".txt"), truth: path(".pose") })
 }

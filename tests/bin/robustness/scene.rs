@@ -1,6 +1,6 @@
 //! Rooms: a table with an object and others anywhere on it, of which nobody says where they are.
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DMat4, DQuat, DVec3};
 use image::{GenericImage, GenericImageView, Rgb, RgbImage};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
@@ -14,6 +14,17 @@ pub const SIZE: [u32; 2] = [640, 480];
 const INSIDE: u32 = 110;
 /// Less than this, of 255, in some channel is no background; the lightest edges are.
 const WHITE: f64 = 250.0;
+
+/// A camera's intrinsics, as data sets have them.
+pub fn intrinsics(focal: f64) -> String {
+    let [width, height] = SIZE;
+    format!("{focal} {} {} 0.\n0. 0. 0.\n1.\n{height} {width}\n", width / 2, height / 2)
+}
+
+/// A pose, likewise.
+pub fn pose(world_from_camera: &DMat4) -> String {
+    world_from_camera.transpose().to_cols_array().map(|value| value.to_string()).join(" ")
+}
 
 /// A room as a camera sees it, and how that is turned against the one that sees the object in the middle: from the new axes to the old ones.
 pub fn room(object: &RgbImage, others: &[RgbImage], random: &mut Pcg64Mcg) -> Result<(RgbImage, DMat3)> {

@@ -101,10 +101,7 @@ pub fn rooms(programs: &Programs, lying: Lying, seed: u64) -> Result<Vec<Room>> 
         let objects: Vec<Object> = (0..).zip(objects).map(in_sight).collect();
         let path = folder.join(format!("{number}.png"));
         picture.save(&path)?;
-        let line = |Object { name, world_from_camera, .. }: &Object| {
-            let rows = world_from_camera.transpose().to_cols_array().map(|value| value.to_string());
-            format!("{name} {}\n", rows.join(" "))
-        };
+        let line = |object: &Object| format!("{} {}\n", object.name, scene::pose(&object.world_from_camera));
         std::fs::write(path.with_extension("txt"), objects.iter().map(line).collect::<String>())?;
         Ok(Room { picture: path, objects })
     };
@@ -116,15 +113,10 @@ pub fn boxed(rooms: &[Room], in_sight: &Range<f64>) -> Result<Vec<(&'static str,
     let mut pictures = Vec::new();
     for Room { picture, objects } in rooms {
         let intrinsics = picture.with_extension("intrinsics");
-        let [width, height] = SIZE;
-        let lines = format!("{FOCAL_OF_ROOM} {} {} 0.\n0. 0. 0.\n1.\n{height} {width}\n", width / 2, height / 2);
-        std::fs::write(&intrinsics, lines)?;
+        std::fs::write(&intrinsics, scene::intrinsics(FOCAL_OF_ROOM))?;
         for (number, object) in objects.iter().enumerate().filter(|(_, object)| in_sight.contains(&object.in_sight)) {
             let truth = picture.with_extension(format!("{number}.pose"));
-            std::fs::write(
-                &truth,
-                object.world_from_camera.transpose().to_cols_array().map(|value| value.to_string()).join(" "),
-            )?;
+            std::fs::write(&truth, scene::pose(&object.world_from_camera))?;
             let bounds = Some(object.bounds.map(|pixels| pixels.to_string()).join(","));
             let (picture, intrinsics) = (picture.clone(), intrinsics.clone());
             pictures.push((object.name, Picture { picture, mask: None, bounds, intrinsics, truth }));

@@ -100,9 +100,7 @@ impl Video {
         for kind in ["rgb", "pose"] {
             std::fs::create_dir_all(folder.join(kind))?;
         }
-        let [width, height] = scene::SIZE;
-        let intrinsics = format!("{FOCAL_OF_ROOM} {} {} 0.\n0. 0. 0.\n1.\n{height} {width}\n", width / 2, height / 2);
-        std::fs::write(folder.join("intrinsics.txt"), intrinsics)?;
+        std::fs::write(folder.join("intrinsics.txt"), scene::intrinsics(FOCAL_OF_ROOM))?;
         for k in 0..ENDS {
             let view = FRAMES.start + k;
             let (since, [x, y]) = if k < LEAVES { (k, PLACES[0]) } else { (k.saturating_sub(BACK), PLACES[1]) };
@@ -113,8 +111,7 @@ impl Video {
             let file = |kind: &str, end: &str| folder.join(kind).join(format!("{view:06}.{end}"));
             frame.save(file("rgb", "png"))?;
             let pose = srn::read_pose(&of(name, "pose", view).with_extension("txt"))? * DMat4::from_mat3(turn);
-            let rows = pose.transpose().to_cols_array().map(|value| value.to_string());
-            std::fs::write(file("pose", "txt"), rows.join(" "))?;
+            std::fs::write(file("pose", "txt"), scene::pose(&pose))?;
         }
         Ok(Video { name, folder, bounds: "auto".into() })
     }
