@@ -8,6 +8,7 @@ use sigma_srn::{Doubt, Effort, Engine, Error, Found, Intrinsics, Model, Search, 
 
 /// Of the pictures in `assets/scenes`.
 const INTRINSICS: Intrinsics = Intrinsics { fx: 297.6, fy: 297.6, cx: 128.0, cy: 128.0, pixel_center: 0.0 };
+const INTRINSICS_OF_HEAP: Intrinsics = Intrinsics { fx: 600.0, fy: 600.0, cx: 320.0, cy: 240.0, pixel_center: 0.0 };
 const FORKLIFT: BoundingBox = BoundingBox { corner: [35.0, 64.0], size: [194.0, 130.0] };
 
 fn search(photo: &Photo, intrinsics: &Intrinsics, bounds: BoundingBox) -> Result<(Shot, Found, FoundObject), Error> {
@@ -21,8 +22,27 @@ fn search(photo: &Photo, intrinsics: &Intrinsics, bounds: BoundingBox) -> Result
 }
 
 fn scene() -> Photo {
-    let picture = image::open("../assets/scenes/forklift.png").unwrap().to_rgba8();
+    opened("../assets/scenes/forklift.png")
+}
+
+fn heap() -> Photo {
+    opened("../assets/scenes/heap.png")
+}
+
+fn opened(path: &str) -> Photo {
+    let picture = image::open(path).unwrap().to_rgba8();
     Photo::from_rgba8(picture.width() as usize, picture.height() as usize, &picture).unwrap()
+}
+
+/// The model's objects in the heap, and where the camera is.
+fn in_heap(model: &Model) -> Vec<(u32, DMat4)> {
+    let truths = std::fs::read_to_string("../assets/scenes/heap.txt").unwrap();
+    let truth = |line: &str| {
+        let (name, rows) = line.split_once(' ').unwrap();
+        let rows: Vec<f64> = rows.split(' ').map(|number| number.parse().unwrap()).collect();
+        model.instance(name).ok().map(|instance| (instance, DMat4::from_cols_slice(&rows).transpose()))
+    };
+    truths.lines().filter_map(truth).collect()
 }
 
 /// Among others, nothing known of its pose; whatever place of a pixel intrinsics count from.
@@ -94,25 +114,37 @@ fn an_object_is_found_anywhere() {
     );
 }
 
+/// By a box around what is in sight of it, half of which lies behind two others of which nothing is known.
+#[test]
+fn an_object_is_found_behind_others() {
+    let model = Model::load(Path::new("../assets/models/compact.safetensors")).unwrap();
+    let (engine, search, instance) = (Engine::cpu(), Search::of(Effort::Fast), model.instance("sensor").unwrap());
+    let photo = (&heap(), &INTRINSICS_OF_HEAP);
+    let bounds = BoundingBox { corner: [394.0, 196.0], size: [152.0, 78.0] };
+    let starts = |shot: &Shot| shot.around(&model, camera::fixed24, None);
+    let (shot, found) = search.run_in_box(&engine, &model, instance, photo, bounds, starts, |_| Ok(())).unwrap();
+    let (_, truth) = in_heap(&model).into_iter().find(|(of, _)| *of == instance).unwrap();
+    let (angle, distance) = camera::pose_error(&found.world_from_camera, &truth);
+    // 0.5° and 0.02 here.
+    assert!(angle < 2.0 && distance < 0.1 && found.is_trusted(), "{angle} {distance} {:?}", found.doubt);
+    let object = FoundObject::of(&shot, &found.world_from_camera, &engine, &model, 1).unwrap();
+    assert!(object.bounds().unwrap().size[1] > 1.2 * bounds.size[1], "{:?}", object.bounds());
+    let sightings = Sightings::in_box(&engine, &model, instance, photo.0, bounds).unwrap();
+    let [right, wrong] = [truth, DMat4::from_rotation_z(1.5) * truth].map(|pose| sightings.evidence(&shot, &pose).unwrap());
+    assert!(wrong < 0.8 * right, "{wrong} {right}");
+}
+
 /// Three of a heap: two of one kind and one colour, one before the other, and what is beside them.
 #[test]
 fn all_objects_of_a_model_are_found_that_are_there() {
     const NAMES: [&str; 2] = ["bucket", "steering"];
     let model = Model::load(Path::new("../assets/models/compact.safetensors")).unwrap();
     let model = model.bake(&NAMES.map(|name| model.instance(name).unwrap())).unwrap();
-    let picture = image::open("../assets/scenes/heap.png").unwrap().to_rgba8();
-    let photo = Photo::from_rgba8(picture.width() as usize, picture.height() as usize, &picture).unwrap();
-    let intrinsics = Intrinsics { fx: 600.0, fy: 600.0, cx: 320.0, cy: 240.0, pixel_center: 0.0 };
+    let photo = (&heap(), &INTRINSICS_OF_HEAP);
     let starts = |shot: &Shot| shot.around(&model, camera::around2016, None);
     let engine = Engine::cpu();
-    let found = Search::of(Effort::Fast).run_for_all(&engine, &model, (&photo, &intrinsics), starts, |_| Ok(())).unwrap();
-    let truths = std::fs::read_to_string("../assets/scenes/heap.txt").unwrap();
-    let truth = |line: &str| {
-        let (name, rows) = line.split_once(' ').unwrap();
-        let rows: Vec<f64> = rows.split(' ').map(|number| number.parse().unwrap()).collect();
-        model.instance(name).ok().map(|instance| (instance, DMat4::from_cols_slice(&rows).transpose()))
-    };
-    let mut truths: Vec<(u32, DMat4)> = truths.lines().filter_map(truth).collect();
+    let found = Search::of(Effort::Fast).run_for_all(&engine, &model, photo, starts, |_| Ok(())).unwrap();
+    let mut truths = in_heap(&model);
     assert_eq!((found.len(), truths.len()), (3, 3));
     for (shot, found) in found {
         let off = |truth: &DMat4| camera::pose_error(&found.world_from_camera, truth);

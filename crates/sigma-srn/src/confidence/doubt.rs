@@ -51,10 +51,10 @@ pub const LEAST_UNEXPLAINED: f64 = 0.12;
 /// How many times that what pictures of the object leave that its training has looked at, see [`Metadata::unexplained`] (`docs/accuracy.md`).
 const ABOVE_LEARNT: f64 = 1.6;
 /// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on, or that is partly hidden (`docs/accuracy.md`).
-const RIVAL: f64 = 0.3;
+pub(crate) const RIVAL: f64 = 0.3;
 
 /// How far apart poses are that are not the same minimum: a turn about the object in degrees.
-const ELSEWHERE_DEG: f64 = 10.0;
+pub(crate) const ELSEWHERE_DEG: f64 = 10.0;
 
 impl Calibration {
     /// Why an estimate of this instance is not to be trusted, by what it leaves unexplained and by its rival, if there is one. An instance that

@@ -44,19 +44,28 @@ pub struct Boxed<'a, E> {
     pub open: &'a dyn Fn(usize, Known) -> Result<Shot, E>,
     /// Where searches start.
     pub starts: StartsOf<'a, E>,
+    /// Where the object may be in its box if a part of it is hidden.
+    pub in_sight: InSight<'a, E>,
 }
 
 /// Where a search for the object in the photograph with this number starts.
 pub type StartsOf<'a, E> = &'a dyn Fn(usize, &Shot) -> Result<Vec<DMat4>, E>;
+
+/// Where in its box ([`Sightings::in_box`]) this instance may be, in the photograph with this number; `None` where nobody wants to know.
+pub type InSight<'a, E> = &'a dyn Fn(usize, u32) -> Result<Option<Sightings<'a>>, E>;
 
 /// Searches for objects in the photographs with these numbers, each from its own starts.
 pub type Pass<'a, L, E> = &'a mut dyn FnMut(&[usize], Vec<Shot>, &[Vec<DMat4>]) -> Result<Vec<Outcome<L>>, E>;
 
 impl<E: From<Error>> Boxed<'_, E> {
     /// Searches for objects in the photographs with these numbers, that were cut out by their boxes alone, then from where these end, cut out anew by the model's view from there. Where that is not to be
-    /// trusted it begins once more with the colours of the model's object; what leaves less unexplained counts.
+    /// trusted something may hide a part of the object; where that leads to none to be trusted it begins once more with the colours of the model's object, and what leaves less unexplained counts.
     pub fn search<L>(&self, numbers: &[usize], shots: Vec<Shot>, pass: Pass<L, E>) -> Result<Vec<Outcome<L>>, E> {
         let outcomes = self.in_turns(numbers, shots, pass)?;
+        let behind = |(&number, outcome): (&usize, Outcome<L>)| {
+            if outcome.found.is_trusted() { Ok(outcome) } else { self.behind(number, outcome, &mut *pass) }
+        };
+        let outcomes = numbers.iter().zip(outcomes).map(behind).collect::<Result<_, E>>()?;
         self.by_colours(numbers, outcomes, pass)
     }
 
@@ -307,7 +316,7 @@ impl<E: From<Error>> Anywhere<'_, E> {
     fn at<T>(&self, bounds: BoundingBox, search: impl FnOnce(&Boxed<E>) -> T) -> T {
         let &Anywhere { engine, model, starts, .. } = self;
         let open = |_, known: Known| self.cut_out(bounds, known);
-        search(&Boxed { engine, model, open: &open, starts: &|_, shot| starts(shot) })
+        search(&Boxed { engine, model, open: &open, starts: &|_, shot| starts(shot), in_sight: &|_, _| Ok(None) })
     }
 
     /// The object in a box.

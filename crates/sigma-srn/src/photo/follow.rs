@@ -173,7 +173,8 @@ impl Follower {
     /// From all around, of a frame that was cut out by the box alone.
     fn around<E: From<Error>>(&self, shot: Shot, looking: &Looking<E>, observe: Observe) -> Result<(Shot, Found), E> {
         let Looking { engine, model, search, starts, open, .. } = *looking;
-        let boxed = Boxed { engine, model, open: &|_, known| open(self.bounds, known), starts: &|_, shot| starts(shot) };
+        let (open, starts) = (|_, known: Known| open(self.bounds, known), |_, shot: &Shot| starts(shot));
+        let boxed = Boxed { engine, model, open: &open, starts: &starts, in_sight: &|_, _| Ok(None) };
         let mut pass = |_: &[usize], shots, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut *observe)?);
         let Outcome { shot, found, .. } = boxed.search(&[0], vec![shot], &mut pass)?.remove(0);
         Ok((shot, found))

@@ -2,14 +2,17 @@
 //! a box around it ([`Boxed`]), in a video from where the object was before ([`Follower`]).
 
 mod all;
+mod behind;
 mod boxed;
 mod follow;
+mod in_sight;
+mod looked;
 mod shown;
 mod sightings;
 mod template;
 
 pub use all::All;
-pub use boxed::{Anywhere, Boxed, Outcome, Pass, StartsOf};
+pub use boxed::{Anywhere, Boxed, InSight, Outcome, Pass, StartsOf};
 pub use follow::{Follower, Looking, Observe, Open};
 pub use shown::FoundObject;
 pub use sightings::{Sighting, Sightings};
@@ -93,6 +96,42 @@ impl Shot {
         self.square.1 as f64 / f64::from(self.side)
     }
 
+    /// Whether the object is in sight at a place in the photograph, in its pixels.
+    fn shows(&self, at: [f64; 2]) -> bool {
+        let [x, y] = [0, 1].map(|k| ((at[k] - self.square.0[k] as f64) / self.pixels_of_photo()).floor());
+        let is_in = [x, y].iter().all(|x| (0.0..f64::from(self.side)).contains(x));
+        let covered = |coverage: &Vec<f32>| coverage[y as usize * self.side as usize + x as usize];
+        is_in && self.coverage.as_ref().is_some_and(|coverage| covered(coverage) > 0.5)
+    }
+
+    /// In half as many pixels to a side, where that is a whole number.
+    fn halved(self) -> Self {
+        if !self.side.is_multiple_of(2) {
+            return self;
+        }
+        let (side, from) = (self.side as usize / 2, self.side as usize);
+        let four = |i: usize| {
+            let first = 2 * (i / side) * from + 2 * (i % side);
+            [first, first + 1, first + from, first + from + 1]
+        };
+        let counts = |pixel: usize| self.weights.as_ref().map_or(1.0, |weights| weights[pixel]);
+        let count = |i: usize| four(i).map(counts).iter().sum::<f32>();
+        // What does not count may be anything.
+        let mean = |i: usize, of: &dyn Fn(usize) -> f32| {
+            let sum = four(i).map(|pixel| counts(pixel) * of(pixel)).iter().sum::<f32>();
+            if count(i) > 0.0 { sum / count(i) } else { of(four(i)[0]) }
+        };
+        let pixels = || 0..side * side;
+        let rgb = pixels().flat_map(|i| [0, 1, 2].map(|c| mean(i, &|pixel| self.rgb[3 * pixel + c]))).collect();
+        let weights = self.weights.as_ref().map(|_| pixels().map(|i| 0.25 * count(i)).collect());
+        let coverage = self.coverage.as_ref().map(|coverage| pixels().map(|i| mean(i, &|pixel| coverage[pixel])).collect());
+        let Intrinsics { fx, fy, cx, cy, pixel_center } = self.intrinsics;
+        // Edges of pixels are whole numbers, half a pixel before their centres.
+        let [cx, cy] = [cx, cy].map(|c| 0.5 * (c - pixel_center + 0.5) - 0.5 + pixel_center);
+        let intrinsics = Intrinsics { fx: 0.5 * fx, fy: 0.5 * fy, cx, cy, pixel_center };
+        Shot { side: side as u32, rgb, weights, coverage, intrinsics, ..self }
+    }
+
     /// What a search takes.
     pub fn query(&self, starts: Vec<DMat4>) -> Query {
         Query {
@@ -152,7 +191,9 @@ impl Search {
     ) -> Result<(Shot, Found), Error> {
         let open = |known: Known| in_box(model, instance, photo, bounds, known);
         let single = self.single()?;
-        let boxed = Boxed { engine, model, open: &|_, known| open(known), starts: &|_, shot| starts(shot) };
+        let in_sight = |_, instance: u32| Sightings::in_box(engine, model, instance, photo.0, bounds).map(Some);
+        let starts = |_, shot: &Shot| starts(shot);
+        let boxed = Boxed { engine, model, open: &|_, known| open(known), starts: &starts, in_sight: &in_sight };
         let first = vec![open(Known::default())?];
         let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
         let Outcome { shot, found, .. } = boxed.search(&[0], first, &mut pass)?.remove(0);
@@ -232,6 +273,28 @@ mod tests {
     use super::*;
     use crate::ModelConfig;
     use crate::camera::{fixed24, pose_error};
+
+    #[test]
+    fn in_half_as_many_pixels_the_object_is_where_it_was() {
+        let intrinsics = Intrinsics { fx: 150.0, fy: 140.0, cx: 3.25, cy: 1.5, pixel_center: 0.0 };
+        let rgb: Vec<f32> = (0..48).map(|k| (k % 7) as f32 / 7.0).collect();
+        let weights: Vec<f32> = (0..16).map(|i| if i % 4 == 0 { 0.0 } else { 1.0 }).collect();
+        let shot = Shot { weights: Some(weights), ..Shot::whole(rgb.clone(), intrinsics, 0, 4) };
+        let half = shot.clone().halved();
+        assert_eq!((half.side, half.rgb.len(), half.pixels_of_photo()), (2, 12, 2.0 * shot.pixels_of_photo()));
+        assert_eq!(half.weights, Some(vec![0.5, 1.0, 0.5, 1.0]));
+        // Of the first column only the second counts.
+        let mean = |pixels: &[usize]| pixels.iter().map(|pixel| rgb[3 * pixel]).sum::<f32>() / pixels.len() as f32;
+        assert!((half.rgb[0] - mean(&[1, 5])).abs() < 1e-6 && (half.rgb[3] - mean(&[2, 3, 6, 7])).abs() < 1e-6);
+        for pixel_center in [0.0, 0.5] {
+            let shot = Shot { intrinsics: Intrinsics { pixel_center, ..intrinsics }, ..shot.clone() };
+            let half = shot.clone().halved().intrinsics;
+            // The edge between the second and the third column, of half as many between the first and the second.
+            let ray = |of: Intrinsics, edge: f64| (edge - 0.5 + of.pixel_center - of.cx) / of.fx;
+            assert!((ray(shot.intrinsics, 2.0) - ray(half, 1.0)).abs() < 1e-12);
+        }
+        assert_eq!(Shot::whole(vec![0.0; 27], intrinsics, 0, 3).halved().side, 3);
+    }
 
     #[test]
     fn a_square_is_faced_from_the_side_that_a_pose_sees() {

@@ -77,6 +77,13 @@ impl FoundObject {
         (!self.silhouette.is_enclosed(at)).then(|| self.silhouette.covers(at))
     }
 
+    /// In which of its view's cells a place lies, of so many to a side; `None` beside the view.
+    pub(super) fn cell_of(&self, at: [f64; 2], side: usize) -> Option<usize> {
+        let [x, y] = self.in_view(at).map(|x| (x * side as f64).floor());
+        let is_in = [x, y].iter().all(|x| (0.0..side as f64).contains(x));
+        is_in.then(|| y as usize * side + x as usize)
+    }
+
     /// A place of the picture in the view, 0 to 1 across and down.
     fn in_view(&self, at: [f64; 2]) -> [f64; 2] {
         let (corner, extent) = self.square;

@@ -116,7 +116,7 @@ fn between<T: Default>(side: usize, at: [f32; 2], cell: impl Fn(usize) -> T, add
 }
 
 /// The cells of [`SIDE`] at most so far away across and down; `None` beyond the edge.
-fn near(i: usize, reach: usize) -> impl Iterator<Item = Option<usize>> {
+pub(super) fn near(i: usize, reach: usize) -> impl Iterator<Item = Option<usize>> {
     let (at, reach) = ([i % SIDE, i / SIDE].map(|at| at as i64), reach as i64);
     let cell = move |dx: i64, dy: i64| {
         let [x, y] = [at[0] + dx, at[1] + dy].map(|at| usize::try_from(at).ok().filter(|at| *at < SIDE));
