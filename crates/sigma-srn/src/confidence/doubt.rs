@@ -51,7 +51,7 @@ pub const LEAST_UNEXPLAINED: f64 = 0.12;
 /// How many times that what pictures of the object leave that its training has looked at, see [`Metadata::unexplained`] (`docs/accuracy.md`).
 const ABOVE_LEARNT: f64 = 1.6;
 /// How much higher, as a part, the loss must be at another pose of an object that the model was not trained on, or that is partly hidden (`docs/accuracy.md`).
-pub(crate) const RIVAL: f64 = 0.3;
+const RIVAL: f64 = 0.3;
 
 /// How far apart poses are that are not the same minimum: a turn about the object in degrees.
 pub(crate) const ELSEWHERE_DEG: f64 = 10.0;

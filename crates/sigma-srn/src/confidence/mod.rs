@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub use self::deviation::{Confidence, Known, Matrix6, WITHIN_95, fit, motion};
 pub(crate) use self::deviation::{moved, promise};
 pub use self::doubt::{Doubt, LEAST_UNEXPLAINED, UNEXPLAINED, unexplained, unexplained_doubt};
-pub(crate) use self::doubt::{ELSEWHERE_DEG, RIVAL, explains_colours, hidden_doubt};
+pub(crate) use self::doubt::{ELSEWHERE_DEG, explains_colours, hidden_doubt};
 
 /// What estimates of known poses told of a model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

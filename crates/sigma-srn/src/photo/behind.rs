@@ -6,12 +6,14 @@ use srn_photo::{BoundingBox, Known};
 use super::boxed::{Boxed, Outcome, Pass};
 use super::{Shot, Sightings};
 use crate::camera::pose_error;
-use crate::confidence::{ELSEWHERE_DEG, RIVAL};
+use crate::confidence::ELSEWHERE_DEG;
 use crate::{Error, Found};
 
 /// So many sides are tried in half as many pixels, and so many poses that the best of these led to in all.
 const SIDES: usize = 9;
 const FINE: usize = 3;
+/// A pose elsewhere leaves at least so many times as much unexplained: each has a mask of its own. For right ones it was 1.8 times or more, for a wrong one 1.3 (`docs/tried.md`).
+const RIVAL: f64 = 1.5;
 
 /// In parts of the longer side of what a pose covers. What is missing along an edge says that the pose is off, not that something hides it there: as near to what is in sight as this, or as narrow as twice the second.
 const RIM: f64 = 0.04;
@@ -30,12 +32,12 @@ impl<E: From<Error>> Boxed<'_, E> {
         let Some(sightings) = (self.in_sight)(number, outcome.shot.instance)? else { return Ok(outcome) };
         let mut seconds = outcome.found.seconds;
         let mut from = |poses: &[DMat4], as_fine: fn(Shot) -> Shot| {
-            let mut found = self.from_behind(number, &sightings, &outcome.shot, poses, as_fine, &mut *pass)?;
+            let mut found = self.tried_from(number, &sightings, &outcome.shot, poses, as_fine, &mut *pass)?;
             seconds += found.iter().map(|outcome| outcome.found.seconds).sum::<f64>();
             found.sort_by(|a, b| a.found.unexplained.total_cmp(&b.found.unexplained));
             Ok::<_, E>(found)
         };
-        let sides: Vec<DMat4> = sightings.from_sides(SIDES).iter().map(|side| sightings.pose(&outcome.shot, side)).collect();
+        let sides: Vec<DMat4> = sightings.apart(SIDES).iter().map(|side| sightings.pose(&outcome.shot, side)).collect();
         let coarse = from(&sides, Shot::halved)?;
         let fine = from(&elsewhere(&coarse, FINE), |shot| shot)?;
         let is_sure = |best: &Outcome<L>| best.found.is_trusted() && !has_rival(&best.found, fine.iter().chain(&coarse));
@@ -47,7 +49,7 @@ impl<E: From<Error>> Boxed<'_, E> {
     }
 
     /// Searched for from each of these poses, by what is in sight there. `shot`: any part of the photograph.
-    fn from_behind<L>(
+    fn tried_from<L>(
         &self,
         number: usize,
         sightings: &Sightings,
@@ -91,7 +93,7 @@ fn apart(poses: impl IntoIterator<Item = DMat4>, most: usize) -> Vec<DMat4> {
 /// Whether another pose elsewhere explains what is in sight from there nearly as well.
 fn has_rival<'a, L: 'a>(found: &Found, mut tried: impl Iterator<Item = &'a Outcome<L>>) -> bool {
     let is_elsewhere = |other: &Found| pose_error(&found.world_from_camera, &other.world_from_camera).0 > ELSEWHERE_DEG;
-    let nearly = |other: &Found| other.unexplained < (1.0 + RIVAL) * found.unexplained;
+    let nearly = |other: &Found| other.unexplained < RIVAL * found.unexplained;
     tried.any(|Outcome { found: other, .. }| is_elsewhere(other) && nearly(other))
 }
 

@@ -117,7 +117,7 @@ impl<'a> Sightings<'a> {
     }
 
     /// The likeliest of them from so many sides, the likeliest first.
-    pub(super) fn from_sides(&self, most: usize) -> Vec<Sighting> {
+    pub(super) fn apart(&self, most: usize) -> Vec<Sighting> {
         let mut sides: Vec<Sighting> = Vec::new();
         for sighting in self.matches.iter().filter_map(|found| self.sighting(found)) {
             if sides.len() == most {
