@@ -29,7 +29,7 @@ impl<E: From<Error>> Boxed<'_, E> {
     /// What was found in a box but is not to be trusted once more, as if something hid a part of it: from the sides that are likeliest in half as many pixels, then from where these lead, and once more from the best. A
     /// pose to be trusted counts, where nothing elsewhere explains what is in sight from there nearly as well.
     pub(super) fn behind<L>(&self, number: usize, outcome: Outcome<L>, pass: Pass<L, E>) -> Result<Outcome<L>, E> {
-        let Some(sightings) = (self.in_sight)(number, outcome.shot.instance)? else { return Ok(outcome) };
+        let Some(sightings) = (self.sightings)(number, outcome.shot.instance)? else { return Ok(outcome) };
         let mut seconds = outcome.found.seconds;
         let mut from = |poses: &[DMat4], as_fine: fn(Shot) -> Shot| {
             let mut found = self.tried_from(number, &sightings, &outcome.shot, poses, as_fine, &mut *pass)?;

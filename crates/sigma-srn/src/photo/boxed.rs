@@ -45,14 +45,14 @@ pub struct Boxed<'a, E> {
     /// Where searches start.
     pub starts: StartsOf<'a, E>,
     /// Where the object may be in its box if a part of it is hidden.
-    pub in_sight: InSight<'a, E>,
+    pub sightings: SightingsOf<'a, E>,
 }
 
 /// Where a search for the object in the photograph with this number starts.
 pub type StartsOf<'a, E> = &'a dyn Fn(usize, &Shot) -> Result<Vec<DMat4>, E>;
 
 /// Where in its box ([`Sightings::in_box`]) this instance may be, in the photograph with this number; `None` where nobody wants to know.
-pub type InSight<'a, E> = &'a dyn Fn(usize, u32) -> Result<Option<Sightings<'a>>, E>;
+pub type SightingsOf<'a, E> = &'a dyn Fn(usize, u32) -> Result<Option<Sightings<'a>>, E>;
 
 /// Searches for objects in the photographs with these numbers, each from its own starts.
 pub type Pass<'a, L, E> = &'a mut dyn FnMut(&[usize], Vec<Shot>, &[Vec<DMat4>]) -> Result<Vec<Outcome<L>>, E>;
@@ -316,7 +316,7 @@ impl<E: From<Error>> Anywhere<'_, E> {
     fn at<T>(&self, bounds: BoundingBox, search: impl FnOnce(&Boxed<E>) -> T) -> T {
         let &Anywhere { engine, model, starts, .. } = self;
         let open = |_, known: Known| self.cut_out(bounds, known);
-        search(&Boxed { engine, model, open: &open, starts: &|_, shot| starts(shot), in_sight: &|_, _| Ok(None) })
+        search(&Boxed { engine, model, open: &open, starts: &|_, shot| starts(shot), sightings: &|_, _| Ok(None) })
     }
 
     /// The object in a box.

@@ -12,7 +12,7 @@ mod sightings;
 mod template;
 
 pub use all::All;
-pub use boxed::{Anywhere, Boxed, InSight, Outcome, Pass, StartsOf};
+pub use boxed::{Anywhere, Boxed, Outcome, Pass, SightingsOf, StartsOf};
 pub use follow::{Follower, Looking, Observe, Open};
 pub use shown::FoundObject;
 pub use sightings::{Sighting, Sightings};
@@ -191,9 +191,9 @@ impl Search {
     ) -> Result<(Shot, Found), Error> {
         let open = |known: Known| in_box(model, instance, photo, bounds, known);
         let single = self.single()?;
-        let in_sight = |_, instance: u32| Sightings::in_box(engine, model, instance, photo.0, bounds).map(Some);
+        let sightings = |_, instance: u32| Sightings::in_box(engine, model, instance, photo.0, bounds).map(Some);
         let starts = |_, shot: &Shot| starts(shot);
-        let boxed = Boxed { engine, model, open: &|_, known| open(known), starts: &starts, in_sight: &in_sight };
+        let boxed = Boxed { engine, model, open: &|_, known| open(known), starts: &starts, sightings: &sightings };
         let first = vec![open(Known::default())?];
         let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
         let Outcome { shot, found, .. } = boxed.search(&[0], first, &mut pass)?.remove(0);
