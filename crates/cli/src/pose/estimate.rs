@@ -54,7 +54,7 @@ pub struct Estimate {
     #[arg(long, value_name = "FILE|DIR")]
     cutout: Vec<PathBuf>,
     /// A box around the object, as detectors give it, instead of a segmentation: left edge, top edge, width and height in pixels of the picture. What in it is the
-    /// object is found by its colours, and then by the pose that was found with these, from where the search is done once more. `auto`: it is looked for in all of the
+    /// object is found by its colours, and then by the pose that was found with these, from where the search is done once more; something may hide a part of it. `auto`: it is looked for in all of the
     /// picture, by how the model shows it from all around, and a pose is searched for at up to two places, until one is to be trusted; where nobody says which object it
     /// is, all of the model's are looked for, and those that are there for sure are told. Once, or once per picture.
     #[arg(long = "box", value_name = "X,Y,W,H|auto", value_parser = bounds, allow_hyphen_values = true, conflicts_with_all = ["cutout", "unseen"])]
