@@ -954,8 +954,9 @@ fn a_box_around_the_object_is_enough() {
     assert!(files(&dir.join("anywhere")).contains(&"seat-photo-outline.png".into()));
     fail(dir, &format!("estimate photo.png {args} --box there --intrinsics camera.txt"), &["--box", "auto"]);
 
-    // Nor which it is.
-    let any = format!("--model {SHIPPED} --executor cpu --effort fast --box auto --intrinsics camera.txt");
+    // Nor which it is, of two.
+    run(dir, &format!("bake --model {SHIPPED} --instance seat --instance chicken --out two.safetensors"), 0);
+    let any = "--model two.safetensors --executor cpu --effort fast --box auto --intrinsics camera.txt";
     let told = json(&run(dir, &format!("estimate photo.png table.png {any} --json --record all"), 1))["images"].take();
     let told = told.as_array().unwrap();
     let seats: Vec<_> = told.iter().filter(|told| told["instance"] == "seat").collect();
