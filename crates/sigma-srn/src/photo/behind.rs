@@ -7,12 +7,12 @@ use super::boxed::{Boxed, Outcome, Pass};
 use super::{Shot, Sightings};
 use crate::camera::pose_error;
 use crate::confidence::ELSEWHERE_DEG;
-use crate::{Error, Found};
+use crate::{Doubt, Error, Found};
 
 /// So many sides are tried in half as many pixels, and so many poses that the best of these led to in all.
 const SIDES: usize = 9;
 const FINE: usize = 3;
-/// A pose elsewhere leaves at least so many times as much unexplained: each has a mask of its own. For all right ones but one it was 1.5 times or more, for a wrong one 1.3 (`docs/tried.md`).
+/// A pose elsewhere leaves at least so many times as much unexplained, or what was found before: each has a mask of its own. For all right ones but one it was 1.5 times or more, for a wrong one 1.3 (`docs/tried.md`).
 const RIVAL: f64 = 1.5;
 
 /// In parts of the longer side of what a pose covers. What is missing along an edge says that the pose is off, not that something hides it there: as near to what is in sight as this, or as narrow as twice the second.
@@ -27,8 +27,8 @@ const CELLS: f64 = 72.0;
 
 impl<E: From<Error>> Boxed<'_, E> {
     /// What was found in a box but is not to be trusted once more, as if something hid a part of it: from the sides that are likeliest in half as many pixels, then from where these lead, and once more from the best. A
-    /// pose to be trusted counts, where nothing elsewhere explains what is in sight from there nearly as well.
-    pub(super) fn behind<L>(&self, number: usize, outcome: Outcome<L>, pass: Pass<L, E>) -> Result<Outcome<L>, E> {
+    /// pose counts that is to be trusted, or explains so much more; where one elsewhere explains what is in sight from there nearly as well it is not to be trusted.
+    pub(super) fn behind<L>(&self, number: usize, mut outcome: Outcome<L>, pass: Pass<L, E>) -> Result<Outcome<L>, E> {
         let Some(sightings) = (self.sightings)(number, outcome.shot.instance)? else { return Ok(outcome) };
         let mut seconds = outcome.found.seconds;
         let mut from = |poses: &[DMat4], as_fine: fn(Shot) -> Shot| {
@@ -39,11 +39,22 @@ impl<E: From<Error>> Boxed<'_, E> {
         };
         let sides: Vec<DMat4> = sightings.apart(SIDES).iter().map(|side| sightings.pose(&outcome.shot, side)).collect();
         let coarse = from(&sides, Shot::halved)?;
-        let fine = from(&elsewhere(&coarse, FINE), |shot| shot)?;
-        let is_sure = |best: &Outcome<L>| best.found.is_trusted() && !has_rival(&best.found, fine.iter().chain(&coarse));
-        let is_found = fine.first().is_some_and(is_sure);
-        let best = if is_found { from(&elsewhere(&fine, 1), |shot| shot)?.pop() } else { None };
-        let mut outcome = best.filter(|best| best.found.is_trusted()).unwrap_or(outcome);
+        let likeliest = elsewhere(&coarse, FINE);
+        let mut fine = from(&likeliest, |shot| shot)?.into_iter();
+        if let Some(mut best) = fine.next() {
+            // Where a coarse one led to counts, not the coarse one.
+            let is_left = |coarse: &&Outcome<L>| likeliest.iter().all(|pose| is_elsewhere(pose, &coarse.found.world_from_camera));
+            if best.found.is_trusted() {
+                if has_rival(&best.found, fine.as_slice().iter().chain(coarse.iter().filter(is_left))) {
+                    best.found.doubt = Some(Doubt::Rival);
+                } else if let Some(again) = from(&[best.found.world_from_camera], |shot| shot)?.pop() {
+                    best = if again.found.is_trusted() { again } else { best };
+                }
+            }
+            if best.found.is_trusted() || RIVAL * best.found.unexplained < outcome.found.unexplained {
+                outcome = best;
+            }
+        }
         outcome.found.seconds = seconds;
         Ok(outcome)
     }
@@ -83,7 +94,7 @@ fn elsewhere<L>(outcomes: &[Outcome<L>], most: usize) -> Vec<DMat4> {
 fn apart(poses: impl IntoIterator<Item = DMat4>, most: usize) -> Vec<DMat4> {
     let mut first: Vec<DMat4> = Vec::new();
     for pose in poses {
-        if first.len() < most && first.iter().all(|other| pose_error(other, &pose).0 > ELSEWHERE_DEG) {
+        if first.len() < most && first.iter().all(|other| is_elsewhere(other, &pose)) {
             first.push(pose);
         }
     }
@@ -92,9 +103,12 @@ fn apart(poses: impl IntoIterator<Item = DMat4>, most: usize) -> Vec<DMat4> {
 
 /// Whether another pose elsewhere explains what is in sight from there nearly as well.
 fn has_rival<'a, L: 'a>(found: &Found, mut tried: impl Iterator<Item = &'a Outcome<L>>) -> bool {
-    let is_elsewhere = |other: &Found| pose_error(&found.world_from_camera, &other.world_from_camera).0 > ELSEWHERE_DEG;
     let nearly = |other: &Found| other.unexplained < RIVAL * found.unexplained;
-    tried.any(|Outcome { found: other, .. }| is_elsewhere(other) && nearly(other))
+    tried.any(|Outcome { found: other, .. }| is_elsewhere(&found.world_from_camera, &other.world_from_camera) && nearly(other))
+}
+
+fn is_elsewhere(pose: &DMat4, other: &DMat4) -> bool {
+    pose_error(pose, other).0 > ELSEWHERE_DEG
 }
 
 /// Where something hides what a pose shows, around which there are these bounds: what is not in sight of it there, but for rims, and somewhat beyond.

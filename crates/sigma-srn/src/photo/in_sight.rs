@@ -20,8 +20,9 @@ const BEST: usize = 600;
 const SLACK: f32 = 0.03;
 /// How bright the object is tried to be lit, beside what least squares say, which go by what hides it, too.
 const LIGHTS: [f32; 3] = [0.8, 1.0, 1.25];
-/// What a cell costs that is hidden in the box, and one beyond; and what counts that surroundings differ.
-const HIDDEN: f32 = 1.0;
+/// What a cell costs that is hidden in the box, more where less surprises than the second; what one beyond costs; and what counts that surroundings differ.
+const HIDDEN: f32 = 0.5;
+const SURPRISES: f32 = 1.0;
 const BEYOND: f32 = 0.5;
 const AROUND: f32 = 0.2;
 /// A cell of a template that has more than this of an object is a part of it.
@@ -85,10 +86,15 @@ fn ends(template: &Template) -> Option<[[f32; 2]; 2]> {
         Some([[0, 1].map(|k| first[k].min(cell[k])), [0, 1].map(|k| last[k].max(cell[k] + 1.0))])
     };
     let [first, last] = cells.fold(None, around)?;
-    // A template's own cells are one of its finest within the edge, half of which is another's.
+    // By as much as this sticks out more are sighted than where nothing does (`docs/tried.md`).
     let rim = 0.5 / SIDE as f32;
     let part = |at: f32| at / template.side as f32;
     Some([first.map(|at| part(at) - rim), last.map(|at| part(at) + rim)])
+}
+
+/// What a cell costs that is unlike the object, by how surprising its colour is: what hides an object is rarer in the picture than the ground is.
+fn hidden(surprise: f32) -> f32 {
+    HIDDEN + (SURPRISES - surprise).max(0.0)
 }
 
 impl Looked {
@@ -121,7 +127,8 @@ impl Looked {
             }
         }
         let sum = |lit: f32| {
-            let cell = |(seen, own): &(Vec4, Vec4)| own.w * (seen.w - off(seen, lit, own.truncate() / own.w)).max(-HIDDEN);
+            let cell =
+                |(seen, own): &(Vec4, Vec4)| own.w * (seen.w - off(seen, lit, own.truncate() / own.w)).max(-hidden(seen.w));
             own.iter().map(cell).sum::<f32>()
         };
         let lights = LIGHTS.into_iter().chain([lit_as(own.iter().map(|(seen, own)| (seen, own)))]);
@@ -136,7 +143,7 @@ impl Looked {
 
     /// Whether each cell of a view of [`SIDE`] pixels is seen where it was found.
     pub(super) fn likeness(&self, found: Match, view: &[f32]) -> Vec<bool> {
-        let template = Template::of(view);
+        let template = Template::of(view, self.own());
         let lit = self.in_sight.as_ref().map_or(1.0, |in_sight| self.judged_in_sight(in_sight, found, &template).1);
         let cells = self.cells(&found, SIDE);
         let colour = |i: usize| 0.5 * Vec3::from_slice(&view[3 * i..]) + 0.5;
@@ -158,13 +165,13 @@ impl Looked {
 #[cfg(test)]
 mod tests {
     use super::super::looked::tests::{object, picture, view};
-    use super::super::template::ROLLS;
+    use super::super::template::{Own, ROLLS};
     use super::*;
 
     /// Of an object of which nearly half is behind something grey, by a box around the rest.
     #[test]
     fn what_is_in_sight_tells_where_the_object_is() {
-        let templates = Templates::of(&[view(|at| object(at).map(|_| [0.7, -0.8, -0.6])), view(object)]);
+        let templates = Templates::of(&[view(|at| object(at).map(|_| [0.7, -0.8, -0.6])), view(object)], Own::All);
         let (middle, diagonal) = ([120.0, 90.0], 50.0);
         let mut hidden = picture(middle, diagonal, 0.0);
         let is_hidden = |i: usize| (i % hidden.width) as f64 > middle[0] + 3.0;
@@ -178,8 +185,15 @@ mod tests {
         let larger = f64::from(found.diagonal) / diagonal;
         assert!(found.template / ROLLS == 1, "{}", found.template);
         assert!(off[0].hypot(off[1]) < 0.12 * diagonal && (0.85..1.15).contains(&larger), "{off:?} {larger}");
+        // Nor does more speak for a larger one, or a smaller one, which have more of it or less.
+        let right = Match { middle: middle.map(|at| at as f32), diagonal: diagonal as f32, ..found };
+        let evidence = |larger: f32| {
+            let found = Match { diagonal: larger * right.diagonal, ..right };
+            looked.judged(found, &Template::of(&view(object), looked.own())).evidence
+        };
+        assert!([0.9, 1.1].iter().all(|&larger| evidence(larger) < evidence(1.0)), "{:?}", [0.9, 1.0, 1.1].map(evidence));
         // The left of it looks like the object, the right does not.
-        let like = looked.likeness(Match { middle: middle.map(|at| at as f32), diagonal: 50.0, ..found }, &view(object));
+        let like = looked.likeness(right, &view(object));
         let cells = |columns: std::ops::Range<usize>| (16..22).flat_map(move |row| columns.clone().map(move |x| row * SIDE + x));
         assert!(cells(8..14).all(|i| like[i]) && !cells(20..26).any(|i| like[i]), "{like:?}");
     }

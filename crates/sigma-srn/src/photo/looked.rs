@@ -10,7 +10,7 @@ use srn_shaders::LinearParams;
 
 use super::in_sight::InSight;
 use super::sightings::FINEST;
-use super::template::{Cell, ROLL, ROLLS, Template, Templates, WIDER, roll};
+use super::template::{Cell, Own, ROLL, ROLLS, Template, Templates, WIDER, roll};
 
 /// The smallest and the largest diagonals that are looked for, in longer and in shorter sides of the picture; and by which factor they grow.
 const SMALLEST: f64 = 0.09375;
@@ -91,6 +91,11 @@ impl Looked {
             levels.push(last.resampled(last.width / 2, last.height / 2));
         }
         Looked { levels, in_sight }
+    }
+
+    /// What of an object is compared with the picture. Where what is in sight of it is summed, a larger one would have more of its edge.
+    pub(super) fn own(&self) -> Own {
+        if self.in_sight.is_some() { Own::All } else { Own::Inner }
     }
 
     /// The most likely ones, the likeliest first.
@@ -504,7 +509,7 @@ pub(super) mod tests {
     #[test]
     fn a_thing_is_found_where_it_is_as_large_and_turned_as_it_is() {
         let of_one_colour = view(|at| object(at).map(|_| [0.7, -0.8, -0.6]));
-        let templates = Templates::of(&[of_one_colour, view(object)]);
+        let templates = Templates::of(&[of_one_colour, view(object)], Own::Inner);
         for (middle, diagonal, turn) in [([120.0, 90.0], 50.0, 0.4), ([70.0, 100.0], 80.0, 2.9), ([150.0, 60.0], 33.0, -1.5)] {
             let looked = Looked::at(picture(middle, diagonal, turn), None, None);
             let found = looked.matches(&templates)[0];
@@ -525,7 +530,7 @@ pub(super) mod tests {
     /// Of an object of which a third is behind something grey, as much speaks for it as for what is left of it, where that is known; else less.
     #[test]
     fn what_hides_an_object_says_nothing() {
-        let (middle, diagonal, template) = ([120.0, 90.0], 50.0, Template::of(&view(object)));
+        let (middle, diagonal, template) = ([120.0, 90.0], 50.0, Template::of(&view(object), Own::Inner));
         let is_hidden = |at: [f64; 2]| at[0] > middle[0] + 0.1 * diagonal;
         let mut hidden = picture(middle, diagonal, 0.0);
         let hides = |i: usize| is_hidden([i % SIDE_OF_PICTURE[0], i / SIDE_OF_PICTURE[0]].map(|at| at as f64 + 0.5));
@@ -544,7 +549,7 @@ pub(super) mod tests {
     fn pictures_of_any_size_and_of_one_colour_have_places_or_none() {
         for [width, height] in [[1, 1], [3, 200], [40, 30]] {
             let pixels = Pixels { width, height, data: vec![0.3; 3 * width * height] };
-            let found = Looked::at(pixels, None, None).matches(&Templates::of(&[view(object), view(|_| None)]));
+            let found = Looked::at(pixels, None, None).matches(&Templates::of(&[view(object), view(|_| None)], Own::Inner));
             assert!(found.iter().all(|found| found.evidence.is_finite()), "{width} × {height}");
         }
     }

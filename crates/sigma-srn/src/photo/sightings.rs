@@ -97,7 +97,7 @@ impl<'a> Sightings<'a> {
         let in_sight = bounds.map(|BoundingBox { corner, size }| InSight::of(corner, size, finer));
         let looked = Looked::at(photo.pixels().area_resample(width, height), is_other, in_sight);
         let views = views_from(engine, model, instance, &cameras)?;
-        let templates = Templates::of(&views);
+        let templates = Templates::of(&views, looked.own());
         let matches = looked.matches(&templates);
         Ok(Sightings { engine, model, instance, looked, finer, views, cameras, templates, matches })
     }
@@ -155,7 +155,7 @@ impl<'a> Sightings<'a> {
         let anew = |at: Match, side: &DMat4| -> Result<Option<Sighting>, Error> {
             let side = towards(side, focal / f64::from(at.diagonal));
             let view = self.views_from(&[side])?.remove(0);
-            let at = self.looked.settled(at, &Template::of(&view));
+            let at = self.looked.settled(at, &self.template(&view));
             Ok(self.seen(at, &view, side))
         };
         let Some(found) = anew(self.place(shot, world_from_camera), world_from_camera)? else { return Ok(vec![]) };
@@ -187,10 +187,14 @@ impl<'a> Sightings<'a> {
         let cameras: Vec<DMat4> = turns.map(turned).collect();
         let views = self.views_from(&cameras)?;
         let judged =
-            zip(&views, cameras).map(|(view, side)| (self.looked.settled(sighting.found, &Template::of(view)), view, side));
+            zip(&views, cameras).map(|(view, side)| (self.looked.settled(sighting.found, &self.template(view)), view, side));
         let likeliest = judged.max_by(|(a, ..), (b, ..)| a.evidence.total_cmp(&b.evidence));
         let likelier = likeliest.filter(|(found, ..)| found.evidence > sighting.found.evidence);
         Ok(likelier.and_then(|(found, view, side)| self.seen(found, view, side)))
+    }
+
+    fn template(&self, view: &[f32]) -> Template {
+        Template::of(view, self.looked.own())
     }
 
     fn views_from(&self, cameras: &[DMat4]) -> Result<Vec<Vec<f32>>, Error> {
@@ -201,7 +205,7 @@ impl<'a> Sightings<'a> {
     pub fn evidence(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<f32, Error> {
         let at = self.place(shot, world_from_camera);
         let view = self.views_from(&[towards(world_from_camera, world_from_camera.w_axis.truncate().length())])?.remove(0);
-        Ok(self.looked.judged(at, &Template::of(&view)).evidence)
+        Ok(self.looked.judged(at, &self.template(&view)).evidence)
     }
 
     /// What a pose that was found in a part of the photograph shows of the object there, and where it looks like it, up to how bright it is lit.

@@ -40,17 +40,27 @@ pub(super) struct Template {
     pub cells: Vec<Cell>,
 }
 
+/// Which of the object's cells are a template's own.
+#[derive(Clone, Copy)]
+pub(super) enum Own {
+    /// Those within its edge, where cells are of both; but a thin thing is nothing but edge.
+    Inner,
+    All,
+}
+
 impl Template {
     /// Of a view of [`SIDE`] pixels, colours in [-1, 1]; without an object, if it shows none.
-    pub fn of(rgb: &[f32]) -> Self {
+    pub fn of(rgb: &[f32], own: Own) -> Self {
         let silhouette = Silhouette::of(rgb, SIDE);
         let is_object: Vec<bool> = (0..SIDE * SIDE).map(|i| silhouette.is_object(i)).collect();
         let object = |i: usize| if is_object[i] { colour(&rgb[3 * i..]).extend(1.0) } else { Vec4::ZERO };
         let object: Vec<Vec4> = (0..SIDE * SIDE).map(object).collect();
-        // At the edge cells are of both, but a thin thing is nothing but edge.
         let inner: Vec<bool> = (0..SIDE * SIDE).map(|i| near(i, 1).all(|near| near.is_some_and(|i| is_object[i]))).collect();
         let count = |are: &[bool]| are.iter().filter(|is| **is).count();
-        let own = if 5 * count(&inner) < 2 * count(&is_object) { &is_object } else { &inner };
+        let own = match own {
+            Own::Inner if 5 * count(&inner) >= 2 * count(&is_object) => &inner,
+            Own::Inner | Own::All => &is_object,
+        };
         let nearby = blurred(&blurred(&object));
         let is_near = |i: usize, reach: usize| near(i, reach).flatten().any(|i| is_object[i]);
         let cell = |i: usize| Cell {
@@ -148,8 +158,8 @@ pub(super) struct Templates {
 
 impl Templates {
     /// Of views of [`SIDE`] pixels, colours in [-1, 1].
-    pub fn of(views: &[Vec<f32>]) -> Self {
-        let views: Vec<Template> = views.iter().map(|rgb| Template::of(rgb)).collect();
+    pub fn of(views: &[Vec<f32>], own: Own) -> Self {
+        let views: Vec<Template> = views.iter().map(|rgb| Template::of(rgb, own)).collect();
         let rolled = |number: usize| {
             let half = views[number / ROLLS].rolled(roll(number)).halved();
             [half.halved(), half]
