@@ -12,7 +12,7 @@ use crate::{Doubt, Error, Found};
 /// So many sides are tried in half as many pixels, and so many poses that the best of these led to in all.
 const SIDES: usize = 9;
 const FINE: usize = 3;
-/// A pose elsewhere leaves at least so many times as much unexplained, or what was found before: each has a mask of its own. For all right ones but one it was 1.5 times or more, for a wrong one 1.3 (`docs/tried.md`).
+/// A pose elsewhere leaves at least so many times as much unexplained, or what was found before: each has a mask of its own. For a wrong one it was 1.3 times, and for some right ones it is less than this (`docs/tried.md`).
 const RIVAL: f64 = 1.5;
 
 /// In parts of the longer side of what a pose covers. What is missing along an edge says that the pose is off, not that something hides it there: as near to what is in sight as this, or as narrow as twice the second.

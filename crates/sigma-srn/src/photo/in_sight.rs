@@ -93,7 +93,7 @@ fn ends(template: &Template) -> Option<[[f32; 2]; 2]> {
 }
 
 /// What a cell costs that is unlike the object, by how surprising its colour is: what hides an object is rarer in the picture than the ground is.
-fn hidden(surprise: f32) -> f32 {
+fn cost(surprise: f32) -> f32 {
     HIDDEN + (SURPRISES - surprise).max(0.0)
 }
 
@@ -127,8 +127,7 @@ impl Looked {
             }
         }
         let sum = |lit: f32| {
-            let cell =
-                |(seen, own): &(Vec4, Vec4)| own.w * (seen.w - off(seen, lit, own.truncate() / own.w)).max(-hidden(seen.w));
+            let cell = |(seen, own): &(Vec4, Vec4)| own.w * (seen.w - off(seen, lit, own.truncate() / own.w)).max(-cost(seen.w));
             own.iter().map(cell).sum::<f32>()
         };
         let lights = LIGHTS.into_iter().chain([lit_as(own.iter().map(|(seen, own)| (seen, own)))]);
