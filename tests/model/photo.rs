@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use glam::{DMat4, DVec3};
-use sigma_srn::photo::{Anywhere, BoundingBox, FoundObject, Known, Outcome, Photo, Shot, Sightings};
+use sigma_srn::photo::{Anywhere, BoundingBox, Boxed, FoundObject, Known, Outcome, Photo, Shot, Sightings};
 use sigma_srn::{Doubt, Effort, Engine, Error, Found, Intrinsics, Model, Search, camera};
 
 /// Of the pictures in `assets/scenes`.
@@ -63,6 +63,26 @@ fn an_object_is_found_in_a_box() {
     }
     // Its forks do not fill the box, nor does it cover what lies outside.
     assert!(object.covers([150.0, 150.0]) && !object.covers([50.0, 80.0]) && !object.covers([150.0, 20.0]));
+    // However much of what was cut out it explains, it is not to be trusted where a box goes further than its outline.
+    let model = Model::load(Path::new("../assets/models/compact.safetensors")).unwrap();
+    let engine = Engine::cpu();
+    let open = |_, known: Known| {
+        let shot = Shot::in_box((&scene(), &INTRINSICS), FORKLIFT, known, shot.instance, 64);
+        shot.ok_or_else(|| Error::Input { input: "box".into(), what: "empty".into() })
+    };
+    let mut pass = |_: &[usize], shots: Vec<Shot>, _: &[_]| {
+        Ok::<_, Error>(shots.into_iter().map(|shot| Outcome { shot, found: found.clone(), log: () }).collect())
+    };
+    let mut doubt = |given: Option<BoundingBox>| {
+        let (given, starts, sightings) = (|_| given, |_, _: &Shot| Ok(vec![]), |_, _| Ok(None));
+        let boxed = Boxed { engine: &engine, model: &model, open: &open, starts: &starts, given: &given, sightings: &sightings };
+        boxed.search(&[0], vec![open(0, Known::default()).unwrap()], &mut pass).unwrap().remove(0).found.doubt
+    };
+    let taller = |part: f64| BoundingBox { size: [194.0, 130.0 * part], ..FORKLIFT };
+    assert_eq!(
+        [None, Some(FORKLIFT), Some(taller(0.8)), Some(taller(1.15))].map(&mut doubt),
+        [None, None, None, Some(Doubt::Inside)]
+    );
 }
 
 /// As in its box, where nobody says where it is.

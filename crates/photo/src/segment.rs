@@ -116,6 +116,15 @@ impl BoundingBox {
         both / (own + others - both)
     }
 
+    /// How far it ends inside another at most, on one of four sides, as a part of that one's width or height; negative where it reaches beyond all of them.
+    pub fn ends_inside(&self, other: &Self) -> f64 {
+        let inside = |k: usize| {
+            let before = self.corner[k] - other.corner[k];
+            before.max(other.size[k] - self.size[k] - before) / other.size[k]
+        };
+        inside(0).max(inside(1))
+    }
+
     /// Whether a place is in it, or so near.
     fn is_within(&self, at: [f64; 2], slack: f64) -> bool {
         (0..2).all(|k| (self.corner[k] - slack..=self.corner[k] + self.size[k] + slack).contains(&at[k]))
@@ -293,6 +302,19 @@ mod tests {
         let place = [(i % WIDTH) as f64 + 0.5, (i / WIDTH) as f64 + 0.5];
         let off = [0, 1].map(|k| (place[k] - BOX.corner[k]) / BOX.size[k] * 2.0 - 1.0);
         off[0].hypot(off[1])
+    }
+
+    #[test]
+    fn a_box_ends_inside_another() {
+        let moved = |by: [f64; 4]| BoundingBox {
+            corner: [40.0 + by[0], 25.0 + by[1]],
+            size: [40.0 + by[2] - by[0], 30.0 + by[3] - by[1]],
+        };
+        let inside = |by| moved(by).ends_inside(&BOX);
+        assert_eq!([inside([0.0; 4]), inside([-4.0, -6.0, 2.0, 30.0])], [0.0, -0.05]);
+        // Of its width left and right, of its height above and below.
+        let each = [[4.0, 0.0, 0.0, 0.0], [-9.0, 6.0, 9.0, 9.0], [0.0, 0.0, -8.0, 0.0], [0.0, 1.5, 0.0, -3.0]];
+        assert_eq!(each.map(inside), [0.1, 0.2, 0.2, 0.1]);
     }
 
     /// How many pixels are taken for what they are not.

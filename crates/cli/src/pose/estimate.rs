@@ -313,12 +313,14 @@ impl Looking<'_> {
         }
         let open = |i: usize, known: Known| Ok(self.args.open(&asked[i].given, on.model, on.side, known)?.shot);
         let starts = |i: usize, shot: &Shot| self.starts_of(shot, &asked[i].given);
+        let box_of = |i: usize| if let Some(Bounds::Box(bounds)) = asked[i].given.bounds { Some(bounds) } else { None };
         let sightings = |i: usize, instance: u32| {
-            let Given { image, bounds, rough, .. } = &asked[i].given;
-            let (&Some(Bounds::Box(bounds)), None) = (bounds, rough) else { return Ok(None) };
+            let Given { image, rough, .. } = &asked[i].given;
+            let (Some(bounds), None) = (box_of(i), rough) else { return Ok(None) };
             Ok(Some(Sightings::in_box(on.engine, on.model, instance, &photo(image)?, bounds)?))
         };
-        let boxed = Boxed { engine: on.engine, model: on.model, open: &open, starts: &starts, sightings: &sightings };
+        let boxed =
+            Boxed { engine: on.engine, model: on.model, open: &open, starts: &starts, given: &box_of, sightings: &sightings };
         let shots = asked.iter().map(|asked| asked.picture.shot.clone()).collect();
         let numbers: Vec<usize> = (0..asked.len()).collect();
         let found = boxed.search(&numbers, shots, &mut |numbers: &[usize], shots, starts: &[_]| {

@@ -28,6 +28,8 @@ pub enum Doubt {
     Hidden,
     /// Too little in the photograph in which it was looked for speaks for the object there, see [`Sightings::evidence`](crate::photo::Sightings::evidence).
     Unlikely,
+    /// Its outline ends far inside the box that was given around the object.
+    Inside,
 }
 
 impl std::fmt::Display for Doubt {
@@ -40,6 +42,7 @@ impl std::fmt::Display for Doubt {
             Doubt::Rival => "another pose does nearly as well",
             Doubt::Hidden => "too much of the object lies behind the mask, and what is in sight does not tell",
             Doubt::Unlikely => "too little in the photograph speaks for it",
+            Doubt::Inside => "its outline ends far inside the box",
         })
     }
 }

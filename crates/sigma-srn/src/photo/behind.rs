@@ -3,7 +3,7 @@
 use glam::DMat4;
 use srn_photo::{BoundingBox, Known};
 
-use super::boxed::{Boxed, Outcome, Pass};
+use super::boxed::{Boxed, Outcome, Pass, is_inside, likelier};
 use super::{Shot, Sightings};
 use crate::camera::pose_error;
 use crate::confidence::ELSEWHERE_DEG;
@@ -34,7 +34,7 @@ impl<E: From<Error>> Boxed<'_, E> {
         let mut from = |poses: &[DMat4], as_fine: fn(Shot) -> Shot| {
             let mut found = self.tried_from(number, &sightings, &outcome.shot, poses, as_fine, &mut *pass)?;
             seconds += found.iter().map(|outcome| outcome.found.seconds).sum::<f64>();
-            found.sort_by(|a, b| a.found.unexplained.total_cmp(&b.found.unexplained));
+            found.sort_by(|a, b| likelier(&a.found, &b.found));
             Ok::<_, E>(found)
         };
         let sides: Vec<DMat4> = sightings.apart(SIDES).iter().map(|side| sightings.pose(&outcome.shot, side)).collect();
@@ -51,7 +51,9 @@ impl<E: From<Error>> Boxed<'_, E> {
                     best = if again.found.is_trusted() { again } else { best };
                 }
             }
-            if best.found.is_trusted() || RIVAL * best.found.unexplained < outcome.found.unexplained {
+            let [is_no_better, is_better] = [&best, &outcome].map(|outcome| is_inside(&outcome.found));
+            let explains_more = RIVAL * best.found.unexplained < outcome.found.unexplained;
+            if best.found.is_trusted() || !is_no_better && (is_better || explains_more) {
                 outcome = best;
             }
         }
@@ -82,7 +84,11 @@ impl<E: From<Error>> Boxed<'_, E> {
             shots.push(as_fine(shot));
             starts.push(vec![*pose]);
         }
-        if shots.is_empty() { Ok(vec![]) } else { pass(&vec![number; shots.len()], shots, &starts) }
+        if shots.is_empty() {
+            return Ok(vec![]);
+        }
+        let found = pass(&vec![number; shots.len()], shots, &starts)?;
+        found.into_iter().map(|outcome| self.judged(number, outcome)).collect()
     }
 }
 
@@ -103,7 +109,7 @@ fn apart(poses: impl IntoIterator<Item = DMat4>, most: usize) -> Vec<DMat4> {
 
 /// Whether another pose elsewhere explains what is in sight from there nearly as well.
 fn has_rival<'a, L: 'a>(found: &Found, mut tried: impl Iterator<Item = &'a Outcome<L>>) -> bool {
-    let nearly = |other: &Found| other.unexplained < RIVAL * found.unexplained;
+    let nearly = |other: &Found| !is_inside(other) && other.unexplained < RIVAL * found.unexplained;
     tried.any(|Outcome { found: other, .. }| is_elsewhere(&found.world_from_camera, &other.world_from_camera) && nearly(other))
 }
 

@@ -1,6 +1,7 @@
 //! Photographs with boxes around their objects: what in a box is the object and where the object is are found in turns.
 
 use std::borrow::Borrow;
+use std::cmp::Ordering;
 
 use glam::{DMat4, DVec2};
 use srn_photo::{BoundingBox, Known, Place};
@@ -24,6 +25,9 @@ const ROOM_BY_COLOURS: f64 = 0.4;
 /// At so many places where it seems to be an object is searched for: of 432 pictures of rooms it is at the first in 423, at the second in 6 (`docs/tried.md`).
 const PLACES: usize = 2;
 
+/// A pose is not to be trusted whose outline ends so far inside the box that was given, as a part of its width or height: boxes may be off by a twentieth, right poses end 2 % inside at most (`docs/tried.md`).
+const INSIDE: f64 = 0.07;
+
 /// What came of a search.
 pub struct Outcome<L> {
     /// What was searched for.
@@ -44,6 +48,8 @@ pub struct Boxed<'a, E> {
     pub open: &'a dyn Fn(usize, Known) -> Result<Shot, E>,
     /// Where searches start.
     pub starts: StartsOf<'a, E>,
+    /// The box around what is in sight of the object in the photograph with this number; `None` where nobody has given one.
+    pub given: &'a dyn Fn(usize) -> Option<BoundingBox>,
     /// Where the object may be in its box if a part of it is hidden.
     pub sightings: SightingsOf<'a, E>,
 }
@@ -86,7 +92,7 @@ impl<E: From<Error>> Boxed<'_, E> {
         let again = self.in_turns(&lost.iter().map(|&i| numbers[i]).collect::<Vec<_>>(), anew, pass)?;
         for (i, mut other) in lost.into_iter().zip(again) {
             let seconds = outcomes[i].found.seconds + other.found.seconds;
-            if other.found.is_trusted() || other.found.unexplained < outcomes[i].found.unexplained {
+            if other.found.is_trusted() || likelier(&other.found, &outcomes[i].found).is_lt() {
                 std::mem::swap(&mut outcomes[i], &mut other);
             }
             outcomes[i].found.seconds = seconds;
@@ -103,13 +109,24 @@ impl<E: From<Error>> Boxed<'_, E> {
         let is_one_sided = |Outline { cut, missing, .. }: Outline| (cut, missing) != (DVec2::ZERO, DVec2::ZERO);
         let is_off = |outcome: &Outcome<L>| outcome.found.estimate.outline.is_some_and(is_one_sided);
         let off: Vec<usize> = (0..second.len()).filter(|&i| is_off(&second[i])).collect();
-        if off.is_empty() {
-            return Ok(second);
+        if !off.is_empty() {
+            let (numbers, wrong): (Vec<_>, Vec<_>) = off.iter().map(|&i| (numbers[i], &second[i])).unzip();
+            let third = self.cut_anew(&numbers, &wrong, pass)?;
+            off.into_iter().zip(third).for_each(|(i, third)| second[i] = third);
         }
-        let (numbers, wrong): (Vec<_>, Vec<_>) = off.iter().map(|&i| (numbers[i], &second[i])).unzip();
-        let third = self.cut_anew(&numbers, &wrong, pass)?;
-        off.into_iter().zip(third).for_each(|(i, third)| second[i] = third);
-        Ok(second)
+        numbers.iter().zip(second).map(|(&number, outcome)| self.judged(number, outcome)).collect()
+    }
+
+    /// In doubt where it does not reach the edges of the box that was given.
+    pub(super) fn judged<L>(&self, number: usize, mut outcome: Outcome<L>) -> Result<Outcome<L>, E> {
+        let Outcome { shot, found, .. } = &outcome;
+        if let Some(given) = (self.given)(number) {
+            let object = FoundObject::of(shot, &found.world_from_camera, self.engine, self.model, 1)?;
+            if object.bounds().is_none_or(|bounds| bounds.ends_inside(&given) > INSIDE) {
+                outcome.found.doubt = Some(Doubt::Inside);
+            }
+        }
+        Ok(outcome)
     }
 
     /// Cut out anew by the model's view from where searches ended, and searched for from there.
@@ -146,6 +163,15 @@ impl<E: From<Error>> Boxed<'_, E> {
         let pixels = renders.iter().flat_map(|render| render.rgb.chunks_exact(3)).map(|c| [c[0], c[1], c[2]]);
         Ok(pixels.filter(|colour| colour.iter().any(|&c| c < WHITE)).collect())
     }
+}
+
+/// In which order: what reaches the edges of its box before what does not, then by what is left unexplained.
+pub(super) fn likelier(found: &Found, other: &Found) -> Ordering {
+    is_inside(found).cmp(&is_inside(other)).then(found.unexplained.total_cmp(&other.unexplained))
+}
+
+pub(super) fn is_inside(found: &Found) -> bool {
+    found.doubt == Some(Doubt::Inside)
 }
 
 /// How a photograph is looked at in which nobody knows where the object is; see [`Boxed`].
@@ -316,7 +342,14 @@ impl<E: From<Error>> Anywhere<'_, E> {
     fn at<T>(&self, bounds: BoundingBox, search: impl FnOnce(&Boxed<E>) -> T) -> T {
         let &Anywhere { engine, model, starts, .. } = self;
         let open = |_, known: Known| self.cut_out(bounds, known);
-        search(&Boxed { engine, model, open: &open, starts: &|_, shot| starts(shot), sightings: &|_, _| Ok(None) })
+        search(&Boxed {
+            engine,
+            model,
+            open: &open,
+            starts: &|_, shot| starts(shot),
+            given: &|_| None,
+            sightings: &|_, _| Ok(None),
+        })
     }
 
     /// The object in a box.

@@ -174,7 +174,8 @@ impl Follower {
     fn around<E: From<Error>>(&self, shot: Shot, looking: &Looking<E>, observe: Observe) -> Result<(Shot, Found), E> {
         let Looking { engine, model, search, starts, open, .. } = *looking;
         let (open, starts) = (|_, known: Known| open(self.bounds, known), |_, shot: &Shot| starts(shot));
-        let boxed = Boxed { engine, model, open: &open, starts: &starts, sightings: &|_, _| Ok(None) };
+        let given = |_| self.expected.is_none().then_some(self.bounds);
+        let boxed = Boxed { engine, model, open: &open, starts: &starts, given: &given, sightings: &|_, _| Ok(None) };
         let mut pass = |_: &[usize], shots, starts: &[_]| Ok(search.shots(engine, model, shots, starts, &mut *observe)?);
         let Outcome { shot, found, .. } = boxed.search(&[0], vec![shot], &mut pass)?.remove(0);
         Ok((shot, found))

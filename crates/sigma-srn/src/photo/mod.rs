@@ -193,7 +193,14 @@ impl Search {
         let single = self.single()?;
         let sightings = |_, instance: u32| Sightings::in_box(engine, model, instance, photo.0, bounds).map(Some);
         let starts = |_, shot: &Shot| starts(shot);
-        let boxed = Boxed { engine, model, open: &|_, known| open(known), starts: &starts, sightings: &sightings };
+        let boxed = Boxed {
+            engine,
+            model,
+            open: &|_, known| open(known),
+            starts: &starts,
+            given: &|_| Some(bounds),
+            sightings: &sightings,
+        };
         let first = vec![open(Known::default())?];
         let mut pass = |_: &[usize], shots, starts: &[_]| single.shots(engine, model, shots, starts, &mut observe);
         let Outcome { shot, found, .. } = boxed.search(&[0], first, &mut pass)?.remove(0);
