@@ -22,14 +22,6 @@ struct Params {
 @group(0) @binding(6) var<storage, read_write> d_y: array<f32>;
 @group(0) @binding(7) var<storage, read_write> d_z: array<f32>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
 // The gradient to a normalised value.
 fn d_normalised(at: u32, i: u32, normalised: f32) -> f32 {
     let gamma = affine[i];

@@ -29,14 +29,6 @@ var<workgroup> w_tile: array<array<vec4<f32>, 16>, 16>;
 // What each of eight invocations has of the sums over the features of four rows.
 var<workgroup> shares: array<array<vec4<f32>, 8>, 8>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
 // What an invocation computes: rows 4 ly, input features 4 lx and 32 + 4 lx, a and b; columns are rows of d_y.
 struct Rows {
     a: mat4x4<f32>,

@@ -22,14 +22,6 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> d_x: array<f32>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
 fn store(part: u32, row: u32, in_: u32, values: vec4<f32>) {
     if (row >= params.rows_per_group) {
         return;

@@ -22,38 +22,6 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> d_x: array<vec4<f32>>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
-// Eight rows of a tile, four features of each.
-struct Eight {
-    r0: vec4<f32>,
-    r1: vec4<f32>,
-    r2: vec4<f32>,
-    r3: vec4<f32>,
-    r4: vec4<f32>,
-    r5: vec4<f32>,
-    r6: vec4<f32>,
-    r7: vec4<f32>,
-}
-
-// Adds the products of `w` with the vectors that the eight lanes from `first` on hold: row k gets lane k's.
-fn multiply_add(sum: ptr<function, Eight>, w: mat4x4<f32>, mine: vec4<f32>, first: u32) {
-    (*sum).r0 += w * subgroupShuffle(mine, first);
-    (*sum).r1 += w * subgroupShuffle(mine, first + 1u);
-    (*sum).r2 += w * subgroupShuffle(mine, first + 2u);
-    (*sum).r3 += w * subgroupShuffle(mine, first + 3u);
-    (*sum).r4 += w * subgroupShuffle(mine, first + 4u);
-    (*sum).r5 += w * subgroupShuffle(mine, first + 5u);
-    (*sum).r6 += w * subgroupShuffle(mine, first + 6u);
-    (*sum).r7 += w * subgroupShuffle(mine, first + 7u);
-}
-
 // Four successive rows of W, as columns.
 fn w_columns(at: u32, stride: u32) -> mat4x4<f32> {
     return mat4x4(weights[at], weights[at + stride], weights[at + 2u * stride], weights[at + 3u * stride]);

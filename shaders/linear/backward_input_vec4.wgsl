@@ -22,14 +22,6 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> d_x: array<vec4<f32>>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
 // Rows of d_y, as columns.
 fn d_y_columns(at: vec4<u32>, o: u32) -> mat4x4<f32> {
     return mat4x4(d_y[at.x + o], d_y[at.y + o], d_y[at.z + o], d_y[at.w + o]);

@@ -22,14 +22,6 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> y: array<f32>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
 // The values at four indices.
 fn w4(at: vec4<u32>) -> vec4<f32> {
     return vec4(weights[at.x], weights[at.y], weights[at.z], weights[at.w]);

@@ -22,14 +22,6 @@ struct Params {
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read_write> y: array<vec4<f32>>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
 // Four rows of x, as columns.
 fn x_columns(row: vec4<u32>, i: u32) -> mat4x4<f32> {
     return mat4x4(x[row.x + i], x[row.y + i], x[row.z + i], x[row.w + i]);

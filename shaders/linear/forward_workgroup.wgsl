@@ -28,14 +28,6 @@ struct Params {
 var<workgroup> x_tile: array<array<vec4<f32>, 16>, 16>;
 var<workgroup> w_tile: array<array<vec4<f32>, 16>, 16>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
 // What an invocation computes: rows 4 ly and 32 + 4 ly, a and b, output features 4 lx and 32 + 4 lx; columns are rows of y.
 struct Sums {
     aa: mat4x4<f32>,

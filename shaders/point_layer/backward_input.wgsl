@@ -20,14 +20,6 @@ struct Params {
 @group(0) @binding(5) var<storage, read> d_y: array<f32>;
 @group(0) @binding(6) var<storage, read_write> d_x: array<f32>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
 fn w(first: u32, j: u32) -> vec3<f32> {
     return vec3(weights[first + 3u * j], weights[first + 3u * j + 1u], weights[first + 3u * j + 2u]);
 }

@@ -19,14 +19,6 @@ struct Params {
 @group(0) @binding(4) var<storage, read> affine: array<f32>;
 @group(0) @binding(5) var<storage, read_write> y: array<f32>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
 fn linear(first: u32, j: u32, point: vec3<f32>) -> f32 {
     let w = vec3(weights[first + 3u * j], weights[first + 3u * j + 1u], weights[first + 3u * j + 2u]);
     return dot(w, point) + weights[first + 3u * params.features + j];

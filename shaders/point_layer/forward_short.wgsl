@@ -19,83 +19,6 @@ struct Params {
 @group(0) @binding(4) var<storage, read> affine: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> y: array<vec4<f32>>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
-// What each team has added up, of four rows; two sides, used by turns, so that none is written while it is read.
-var<workgroup> of_teams: array<vec4<f32>, 8>;
-
-// Teams of eight lanes that share rows.
-fn teams_of_row() -> u32 {
-    return select(select(1u, 2u, params.features > 64u), 4u, params.features > 128u);
-}
-
-// Sums over the lanes of four rows; all of them get it.
-fn total(mine: vec4<f32>, index: u32, side: u32) -> vec4<f32> {
-    var sum = mine;
-    sum += subgroupShuffleXor(sum, 1u);
-    sum += subgroupShuffleXor(sum, 2u);
-    sum += subgroupShuffleXor(sum, 4u);
-    let teams = teams_of_row();
-    if (teams > 1u) {
-        if (index % 8u == 0u) {
-            of_teams[4u * side + index / 8u] = sum;
-        }
-        workgroupBarrier();
-        let first = 4u * side + index / 8u / teams * teams;
-        sum = of_teams[first] + of_teams[first + 1u];
-        if (teams > 2u) {
-            sum += of_teams[first + 2u] + of_teams[first + 3u];
-        }
-    }
-    return sum;
-}
-
-// Weights of four features for each coordinate of the point, and their bias.
-struct Weights {
-    x: vec4<f32>,
-    y: vec4<f32>,
-    z: vec4<f32>,
-    bias: vec4<f32>,
-}
-
-// Those of column `c`; zero beyond the row.
-fn column(first: u32, c: u32) -> Weights {
-    let n = params.features / 4u;
-    let j = min(c, n - 1u);
-    let p = weights[first + 3u * j];
-    let q = weights[first + 3u * j + 1u];
-    let r = weights[first + 3u * j + 2u];
-    let inside = f32(c < n);
-    return Weights(
-        inside * vec4(p.x, p.w, q.z, r.y),
-        inside * vec4(p.y, q.x, q.w, r.z),
-        inside * vec4(p.z, q.y, r.x, r.w),
-        inside * weights[first + 3u * n + j],
-    );
-}
-
-// Sums over four features.
-fn sums(w: Weights) -> vec4<f32> {
-    let one = vec4(1.0);
-    return vec4(dot(w.x, one), dot(w.y, one), dot(w.z, one), dot(w.bias, one));
-}
-
-// Weights less their mean: what they make has no mean. Zero beyond the row.
-fn centred(w: Weights, mean: vec4<f32>, c: u32) -> Weights {
-    let m = mean * f32(c < params.features / 4u);
-    return Weights(w.x - m.x, w.y - m.y, w.z - m.z, w.bias - m.w);
-}
-
-fn linear(w: Weights, point: vec3<f32>) -> vec4<f32> {
-    return w.x * point.x + w.y * point.y + w.z * point.z + w.bias;
-}
-
 // The point of a row.
 fn point(at: u32) -> vec3<f32> {
     return vec3(x[3u * at], x[3u * at + 1u], x[3u * at + 2u]);
@@ -135,7 +58,7 @@ fn main(
     let first_weight = weights_of(group) / 4u;
     let raw_c = column(first_weight, c);
     let raw_d = column(first_weight, d);
-    let mean = total(sums(raw_c) + sums(raw_d), index, 1u) / f32(params.features);
+    let mean = total(sums(raw_c, true) + sums(raw_d, true), index, 1u) / f32(params.features);
     let w_c = centred(raw_c, mean, c);
     let w_d = centred(raw_d, mean, d);
     let gamma_c = affine[i];

@@ -19,80 +19,6 @@ struct Params {
 @group(0) @binding(4) var<storage, read> affine: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> y: array<vec4<f32>>;
 
-// Where the weights of a group begin, in elements.
-fn weights_of(group: u32) -> u32 {
-    if (params.weight_stride == 0u) {
-        return 0u;
-    }
-    return slots[params.first_group + group] * params.weight_stride;
-}
-
-// A number for each of a lane's eight vectors.
-struct Eight {
-    a: vec4<f32>,
-    b: vec4<f32>,
-}
-
-// Sums over the vectors of a row, 1, 2, 4 or 8 successive ones of each of eight lanes; all of them get their row's sum.
-fn total(mine: Eight, per_row: u32) -> Eight {
-    var a = mine.a;
-    var b = mine.b;
-    a = select(a, a + a.yxwz, per_row > 1u);
-    b = select(b, b + b.yxwz, per_row > 1u);
-    a = select(a, a + a.zwxy, per_row > 2u);
-    b = select(b, b + b.zwxy, per_row > 2u);
-    let both = a + b;
-    a = select(a, both, per_row > 4u);
-    b = select(b, both, per_row > 4u);
-    a += subgroupShuffleXor(a, 1u);
-    b += subgroupShuffleXor(b, 1u);
-    a += subgroupShuffleXor(a, 2u);
-    b += subgroupShuffleXor(b, 2u);
-    a += subgroupShuffleXor(a, 4u);
-    b += subgroupShuffleXor(b, 4u);
-    return Eight(a, b);
-}
-
-// Weights of four features for each coordinate of the point, and their bias.
-struct Weights {
-    x: vec4<f32>,
-    y: vec4<f32>,
-    z: vec4<f32>,
-    bias: vec4<f32>,
-}
-
-// Those of column `c`; zero beyond the row.
-fn column(first: u32, c: u32) -> Weights {
-    let n = params.features / 4u;
-    let j = min(c, n - 1u);
-    let p = weights[first + 3u * j];
-    let q = weights[first + 3u * j + 1u];
-    let r = weights[first + 3u * j + 2u];
-    let inside = f32(c < n);
-    return Weights(
-        inside * vec4(p.x, p.w, q.z, r.y),
-        inside * vec4(p.y, q.x, q.w, r.z),
-        inside * vec4(p.z, q.y, r.x, r.w),
-        inside * weights[first + 3u * n + j],
-    );
-}
-
-// Sums over four features, if the vector is one of its own.
-fn sums(w: Weights, counts: bool) -> vec4<f32> {
-    let one = vec4(f32(counts));
-    return vec4(dot(w.x, one), dot(w.y, one), dot(w.z, one), dot(w.bias, one));
-}
-
-// Weights less their mean: what they make has no mean. Zero beyond the row.
-fn centred(w: Weights, mean: vec4<f32>, c: u32) -> Weights {
-    let m = mean * f32(c < params.features / 4u);
-    return Weights(w.x - m.x, w.y - m.y, w.z - m.z, w.bias - m.w);
-}
-
-fn linear(w: Weights, point: vec3<f32>) -> vec4<f32> {
-    return w.x * point.x + w.y * point.y + w.z * point.z + w.bias;
-}
-
 fn put(group: u32, row: u32, end: u32, column: u32, value: vec4<f32>) {
     if (row < end && column < params.features / 4u) {
         y[(group * params.rows_per_group + row) * (params.features / 4u) + column] = max(value, vec4(0.0));
@@ -107,7 +33,7 @@ fn main(
     @builtin(subgroup_size) subgroup_size: u32,
     @builtin(subgroup_invocation_id) lane: u32,
 ) {
-    // Eight lanes of a subgroup are a team, whatever its size: 1, 2, 4 or 8 vectors of each make a row.
+    // Slots lanes of a subgroup are a team, whatever its size: 1, 2, 4 or 8 vectors of each make a row.
     let n = params.features / 4u;
     let per_row = select(select(select(1u, 2u, n > 8u), 4u, n > 16u), 8u, n > 32u);
     let member = lane % 8u;
@@ -198,11 +124,11 @@ fn main(
         let z5 = linear(w5, subgroupShuffle(mine, octet + 5u / per_row));
         let z6 = linear(w6, subgroupShuffle(mine, octet + 6u / per_row));
         let z7 = linear(w7, subgroupShuffle(mine, octet + 7u / per_row));
-        let squares = total(Eight(
+        let squares = total(Slots(
             vec4(dot(z0, z0), dot(z1, z1), dot(z2, z2), dot(z3, z3)),
             vec4(dot(z4, z4), dot(z5, z5), dot(z6, z6), dot(z7, z7)),
         ), per_row);
-        let rstd = Eight(
+        let rstd = Slots(
             1.0 / sqrt(squares.a / f32(params.features) + 1e-5),
             1.0 / sqrt(squares.b / f32(params.features) + 1e-5),
         );

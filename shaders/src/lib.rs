@@ -88,6 +88,8 @@ pub struct Variant {
     pub name: &'static str,
     /// The WGSL text of the file.
     pub text: &'static str,
+    /// Texts of `common/` that it shares with some others: they use its parameters and buffers, so they cannot stand before every kernel.
+    pub with: &'static [&'static str],
     /// Elements of the step's extent that one workgroup covers, per dimension.
     pub tile: [u32; 3],
     /// What must hold before it may be used; nothing for the plain form.
@@ -114,7 +116,8 @@ pub struct Kernel {
 impl Kernel {
     /// The WGSL source of one variant: shared functions, then the kernel; complete but for [`Cooperative::head`].
     pub fn source(&self, variant: &Variant) -> String {
-        format!("{COMMON}\n{}", variant.text)
+        let parts = [&[COMMON], variant.with, &[variant.text]];
+        parts.concat().join("\n")
     }
 
     /// `op/variant`, in profiles and errors.

@@ -17,7 +17,8 @@ macro_rules! table {
         $(#[$doc:meta])*
         $id:ident = $op:literal / $direction:literal, $params:ident, tile $tile:expr,
         ($($in:ident: $in_ty:ident),*) -> ($($out:ident: $out_ty:ident),*)
-        $(, or $variant:literal tile $variant_tile:expr, when [$($requires:ident),*])*;
+        $(, with [$($with:literal),*])?
+        $(, or $variant:literal tile $variant_tile:expr, when [$($requires:ident),*] $(, with [$($variant_with:literal),*])?)*;
     )*) => {
         $(
             $(#[$doc])*
@@ -34,12 +35,14 @@ macro_rules! table {
                     Variant {
                         name: $direction,
                         text: include_str!(concat!("../", $op, "/", $direction, ".wgsl")),
+                        with: &[$($(include_str!(concat!("../common/", $with, ".wgsl"))),*)?],
                         tile: $tile,
                         requires: &[],
                     },
                     $(Variant {
                         name: $variant,
                         text: include_str!(concat!("../", $op, "/", $variant, ".wgsl")),
+                        with: &[$($(include_str!(concat!("../common/", $variant_with, ".wgsl"))),*)?],
                         tile: $variant_tile,
                         requires: &[$(Requirement::$requires),*],
                     },)*
@@ -84,19 +87,19 @@ table! {
     /// `y[r,o] (+)= Σ_i W[o,i] x[r,i] + b[o]`, weights at `slots[first_group + r / rows_per_group] · weight_stride`.
     /// Extent: rows of a group × out_features × groups.
     LINEAR_FORWARD = "linear"/"forward", LinearParams, tile [64, 32, 1],
-        (x: f32, weights: f32, slots: u32) -> (y: f32),
-        or "forward_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
-        or "forward_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
-        or "forward_subgroup" tile [128, 64, 1], when [FeaturesMultipleOf4, Subgroups],
-        or "forward_cooperative" tile [64, 128, 1], when [FeaturesMultipleOf4, FeaturesAtMost1024, CooperativeMatrices];
+        (x: f32, weights: f32, slots: u32) -> (y: f32), with ["weights_of"],
+        or "forward_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4], with ["weights_of"],
+        or "forward_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4], with ["weights_of"],
+        or "forward_subgroup" tile [128, 64, 1], when [FeaturesMultipleOf4, Subgroups], with ["weights_of", "eight"],
+        or "forward_cooperative" tile [64, 128, 1], when [FeaturesMultipleOf4, FeaturesAtMost1024, CooperativeMatrices], with ["weights_of", "halves"];
     /// `d_x[g,c,r,i] (+)= Σ_o W[o,i] d_y[g,r,o]` over the output features of chunk `c`, `d_x [groups, chunks, rows_per_group, in]`.
     /// Extent: rows of a group × in_features × (groups · chunks).
     LINEAR_BACKWARD_INPUT = "linear"/"backward_input", LinearParams, tile [64, 32, 1],
-        (d_y: f32, weights: f32, slots: u32) -> (d_x: f32),
-        or "backward_input_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
-        or "backward_input_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
-        or "backward_input_subgroup" tile [128, 64, 1], when [FeaturesMultipleOf4, Subgroups],
-        or "backward_input_cooperative" tile [64, 128, 1], when [FeaturesMultipleOf4, FeaturesAtMost1024, CooperativeMatrices];
+        (d_y: f32, weights: f32, slots: u32) -> (d_x: f32), with ["weights_of"],
+        or "backward_input_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4], with ["weights_of"],
+        or "backward_input_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4], with ["weights_of"],
+        or "backward_input_subgroup" tile [128, 64, 1], when [FeaturesMultipleOf4, Subgroups], with ["weights_of", "eight"],
+        or "backward_input_cooperative" tile [64, 128, 1], when [FeaturesMultipleOf4, FeaturesAtMost1024, CooperativeMatrices], with ["weights_of", "halves"];
     /// `partial[g,c] (+)= (Σ_r d_y[r,o] x[r,i], Σ_r d_y[r,o])` over the rows of chunk `c`: weight, then bias; `[groups, chunks, out·in + out]`.
     /// Extent: out_features × in_features × (groups · chunks). (Independent of `slots`: group `g` writes set `g`.)
     LINEAR_BACKWARD_WEIGHT = "linear"/"backward_weight", LinearParams, tile [32, 32, 1],
@@ -104,20 +107,20 @@ table! {
         or "backward_weight_rows" tile [32, 4, 1], when [],
         or "backward_weight_vec4" tile [64, 64, 1], when [FeaturesMultipleOf4],
         or "backward_weight_workgroup" tile [64, 64, 1], when [FeaturesMultipleOf4],
-        or "backward_weight_subgroup" tile [128, 128, 1], when [FeaturesMultipleOf4, Subgroups];
+        or "backward_weight_subgroup" tile [128, 128, 1], when [FeaturesMultipleOf4, Subgroups], with ["eight"];
     /// `y = relu(gamma (x - mean) rstd + beta)`, `rstd = 1/√(var + 1e-5)`, biased variance.
     /// `x [rows, features]`, `affine [2, features]` → `y`, `stats [rows,2]` = (mean, rstd). Extent: rows.
     LAYER_NORM_RELU_FORWARD = "layer_norm_relu"/"forward", LayerNormParams, tile FLAT,
         (x: f32, affine: f32) -> (y: f32, stats: f32),
         or "forward_vec4" tile FLAT, when [FeaturesMultipleOf4],
-        or "forward_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups],
-        or "forward_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "forward_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups], with ["team"],
+        or "forward_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups], with ["teams"];
     /// Gradient to `x`: with `e = gamma · d_y` where `y > 0`, else 0: `d_x = rstd (e - mean(e) - x̂ mean(e x̂))`. Extent: rows.
     LAYER_NORM_RELU_BACKWARD_INPUT = "layer_norm_relu"/"backward_input", LayerNormParams, tile FLAT,
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (d_x: f32),
         or "backward_input_vec4" tile FLAT, when [FeaturesMultipleOf4],
-        or "backward_input_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups],
-        or "backward_input_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        or "backward_input_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups], with ["team"],
+        or "backward_input_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups], with ["teams"];
     /// Sums of `d_y x̂` and `d_y` (where `y > 0`) over the rows of each chunk: `partial [chunks, 2, features]`. Extent: features × chunks.
     LAYER_NORM_RELU_BACKWARD_AFFINE = "layer_norm_relu"/"backward_affine", LayerNormParams, tile [64, 1, 1],
         (x: f32, stats: f32, affine: f32, d_y: f32) -> (partial: f32),
@@ -126,25 +129,25 @@ table! {
     /// `linear/forward` and then `layer_norm_relu/forward` of what it makes, `z`. No plan has this step: a device that is faster so joins the two.
     /// `x [rows, in]`, `affine [2, out]` → `z, y [rows, out]`, `stats [rows, 2]`. Extent: rows of a group × 1 × groups.
     HIDDEN_LAYER_FORWARD = "hidden_layer"/"forward", HiddenLayerParams, tile FLAT,
-        (x: f32, weights: f32, slots: u32, affine: f32) -> (z: f32, y: f32, stats: f32),
-        or "forward_workgroup" tile [32, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost64];
+        (x: f32, weights: f32, slots: u32, affine: f32) -> (z: f32, y: f32, stats: f32), with ["weights_of"],
+        or "forward_workgroup" tile [32, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost64], with ["weights_of"];
     /// `linear/backward_input` and then `layer_norm_relu/backward_input` of the layer before, likewise: from the gradient `d_z` of this layer to
     /// `d_y` and `d_z` of that one, which has as many features and takes the place of this one's. `x` is what the norm of that one read. Extent: rows of a group × 1 × groups.
     HIDDEN_LAYER_BACKWARD_INPUT = "hidden_layer"/"backward_input", HiddenLayerParams, tile FLAT,
-        (weights: f32, slots: u32, x: f32, stats: f32, affine: f32) -> (d_y: f32, d_z: f32),
-        or "backward_input_workgroup" tile [32, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost64];
+        (weights: f32, slots: u32, x: f32, stats: f32, affine: f32) -> (d_y: f32, d_z: f32), with ["weights_of"],
+        or "backward_input_workgroup" tile [32, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost64], with ["weights_of"];
     /// The first layer of a network of points, where no weight takes a gradient: linear map, layer norm and ReLU in one, and nothing kept.
     /// `z = W x + b`, `y = relu(gamma (z - mean) rstd + beta)`; `x [rows, 3]`, `affine [2, features]` → `y [rows, features]`.
     /// Extent: rows of a group × 1 × groups.
     POINT_LAYER_FORWARD = "point_layer"/"forward", PointLayerParams, tile FLAT,
-        (x: f32, weights: f32, slots: u32, affine: f32) -> (y: f32),
-        or "forward_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups],
-        or "forward_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        (x: f32, weights: f32, slots: u32, affine: f32) -> (y: f32), with ["weights_of"],
+        or "forward_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups], with ["weights_of", "team", "point_weights"],
+        or "forward_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups], with ["weights_of", "teams", "point_weights"];
     /// `d_x (+)= Wᵀ d_z`, `d_z` as the gradient of `layer_norm_relu`. Extent: rows of a group × 1 × groups.
     POINT_LAYER_BACKWARD_INPUT = "point_layer"/"backward_input", PointLayerParams, tile FLAT,
-        (x: f32, weights: f32, slots: u32, affine: f32, d_y: f32) -> (d_x: f32),
-        or "backward_input_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups],
-        or "backward_input_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups];
+        (x: f32, weights: f32, slots: u32, affine: f32, d_y: f32) -> (d_x: f32), with ["weights_of"],
+        or "backward_input_subgroup" tile [128, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups], with ["weights_of", "team", "point_weights"],
+        or "backward_input_short" tile [16, 1, 1], when [FeaturesMultipleOf4, FeaturesAtMost256, Subgroups], with ["weights_of", "teams", "point_weights"];
     /// Gates in the order i, f, g, o: `c = σ(f) c_prev + σ(i) tanh(g)`, `h = σ(o) tanh(c)`.
     /// `gates [rows, 4·hidden]` before activation, `c_prev [rows, hidden]` → `h, c [rows, hidden]`. Extent: rows · hidden.
     LSTM_CELL_FORWARD = "lstm_cell"/"forward", LstmParams, tile FLAT,
