@@ -66,13 +66,9 @@ fn an_object_is_found_in_a_box() {
     // However much of what was cut out it explains, it is not to be trusted where a box goes further than its outline.
     let model = Model::load(Path::new("../assets/models/compact.safetensors")).unwrap();
     let engine = Engine::cpu();
-    let open = |_, known: Known| {
-        let shot = Shot::in_box((&scene(), &INTRINSICS), FORKLIFT, known, shot.instance, 64);
-        shot.ok_or_else(|| Error::Input { input: "box".into(), what: "empty".into() })
-    };
-    let mut pass = |_: &[usize], shots: Vec<Shot>, _: &[_]| {
-        Ok::<_, Error>(shots.into_iter().map(|shot| Outcome { shot, found: found.clone(), log: () }).collect())
-    };
+    let photo = scene();
+    let open = |_, known: Known| cut_out((&photo, &INTRINSICS), FORKLIFT, known, shot.instance);
+    let mut pass = finding(&found);
     let mut doubt = |given: Option<BoundingBox>| {
         let (given, starts, sightings) = (|_| given, |_, _: &Shot| Ok(vec![]), |_, _| Ok(None));
         let boxed = Boxed { engine: &engine, model: &model, open: &open, starts: &starts, given: &given, sightings: &sightings };
@@ -83,6 +79,17 @@ fn an_object_is_found_in_a_box() {
         [None, Some(FORKLIFT), Some(taller(0.8)), Some(taller(1.15))].map(&mut doubt),
         [None, None, None, Some(Doubt::Inside)]
     );
+}
+
+fn cut_out(photo: (&Photo, &Intrinsics), bounds: BoundingBox, known: Known, instance: u32) -> Result<Shot, Error> {
+    let shot = Shot::in_box(photo, bounds, known, instance, 64);
+    shot.ok_or_else(|| Error::Input { input: "box".into(), what: "empty".into() })
+}
+
+/// Searches that all end where this one did.
+fn finding(found: &Found) -> impl FnMut(&[usize], Vec<Shot>, &[Vec<DMat4>]) -> Result<Vec<Outcome<()>>, Error> {
+    let outcome = |shot| Outcome { shot, found: found.clone(), log: () };
+    move |_, shots, _| Ok(shots.into_iter().map(outcome).collect())
 }
 
 /// As in its box, where nobody says where it is.
@@ -116,13 +123,8 @@ fn an_object_is_found_anywhere() {
     }
     // However much of a picture a pose explains, it is not to be trusted where the photograph shows the object elsewhere.
     let aside = Found { world_from_camera: truth * DMat4::from_translation(DVec3::new(0.4, 0.0, 0.0)), ..found };
-    let open = |bounds, known: Known| {
-        let shot = Shot::in_box((&photo, &INTRINSICS), bounds, known, instance, 64);
-        shot.ok_or_else(|| Error::Input { input: "box".into(), what: "empty".into() })
-    };
-    let mut pass = |_: &[usize], shots: Vec<Shot>, _: &[_]| {
-        Ok::<_, Error>(shots.into_iter().map(|shot| Outcome { shot, found: aside.clone(), log: () }).collect())
-    };
+    let open = |bounds, known: Known| cut_out((&photo, &INTRINSICS), bounds, known, instance);
+    let mut pass = finding(&aside);
     let anywhere = Anywhere { engine: &engine, model: &model, open: &open, starts: &|_| Ok(vec![]), others: None };
     let told = anywhere.search(&sightings, &mut pass).unwrap().unwrap().found;
     assert_eq!((aside.doubt, told.doubt), (None, Some(Doubt::Unlikely)));
@@ -150,8 +152,19 @@ fn an_object_is_found_behind_others() {
     let object = FoundObject::of(&shot, &found.world_from_camera, &engine, &model, 1).unwrap();
     assert!(object.bounds().unwrap().size[1] > 1.2 * bounds.size[1], "{:?}", object.bounds());
     let sightings = Sightings::in_box(&engine, &model, instance, photo.0, bounds).unwrap();
-    let [right, wrong] = [truth, DMat4::from_rotation_z(1.5) * truth].map(|pose| sightings.evidence(&shot, &pose).unwrap());
+    let turned = DMat4::from_rotation_z(1.5) * truth;
+    let [right, wrong] = [truth, turned].map(|pose| sightings.evidence(&shot, &pose).unwrap());
     assert!(wrong < 0.8 * right, "{wrong} {right}");
+    // However much of what was cut out it explains, it is not to be trusted where more in the box speaks for another side.
+    let open = |_, known: Known| cut_out(photo, bounds, known, instance);
+    let (starts, given) = (|_, _: &Shot| Ok(vec![]), |_| None);
+    let sightings = |_, instance| Sightings::in_box(&engine, &model, instance, photo.0, bounds).map(Some);
+    let boxed = Boxed { engine: &engine, model: &model, open: &open, starts: &starts, given: &given, sightings: &sightings };
+    let doubt = |pose: DMat4| {
+        let found = Found { world_from_camera: pose, ..found.clone() };
+        boxed.search(&[0], vec![shot.clone()], &mut finding(&found)).unwrap().remove(0).found.doubt
+    };
+    assert_eq!([found.world_from_camera, turned].map(doubt), [None, Some(Doubt::Unlikely)]);
 }
 
 /// Three of a heap: two of one kind and one colour, one before the other, and what is beside them.

@@ -26,7 +26,8 @@ pub enum Doubt {
     /// It explains the picture by much of the object lying where the picture does not count, and of what is in sight neither its outline nor its colours
     /// tell: many poses are right.
     Hidden,
-    /// Too little in the photograph in which it was looked for speaks for the object there, see [`Sightings::evidence`](crate::photo::Sightings::evidence).
+    /// Too little in the photograph in which it was looked for speaks for the object there, see [`Sightings::evidence`](crate::photo::Sightings::evidence); or too much in its box for the object seen from
+    /// another side.
     Unlikely,
     /// Its outline ends far inside the box that was given around the object.
     Inside,

@@ -88,7 +88,7 @@ impl<E: From<Error>> Boxed<'_, E> {
             return Ok(vec![]);
         }
         let found = pass(&vec![number; shots.len()], shots, &starts)?;
-        found.into_iter().map(|outcome| self.judged(number, outcome)).collect()
+        found.into_iter().map(|outcome| self.judged(number, outcome, Some(sightings))).collect()
     }
 }
 

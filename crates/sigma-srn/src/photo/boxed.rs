@@ -114,18 +114,35 @@ impl<E: From<Error>> Boxed<'_, E> {
             let third = self.cut_anew(&numbers, &wrong, pass)?;
             off.into_iter().zip(third).for_each(|(i, third)| second[i] = third);
         }
-        numbers.iter().zip(second).map(|(&number, outcome)| self.judged(number, outcome)).collect()
+        let judged = |(&number, outcome): (&usize, Outcome<L>)| {
+            let is_trusted = outcome.found.is_trusted();
+            let sightings = if is_trusted { (self.sightings)(number, outcome.shot.instance)? } else { None };
+            self.judged(number, outcome, sightings.as_ref())
+        };
+        numbers.iter().zip(second).map(judged).collect()
     }
 
-    /// In doubt where it does not reach the edges of the box that was given.
-    pub(super) fn judged<L>(&self, number: usize, mut outcome: Outcome<L>) -> Result<Outcome<L>, E> {
+    /// In doubt where it does not reach the edges of the box that was given, or where more in it speaks for another side.
+    pub(super) fn judged<L>(
+        &self,
+        number: usize,
+        mut outcome: Outcome<L>,
+        sightings: Option<&Sightings>,
+    ) -> Result<Outcome<L>, E> {
         let Outcome { shot, found, .. } = &outcome;
+        let mut doubt = None;
+        if let Some(sightings) = sightings.filter(|_| found.is_trusted())
+            && sightings.is_outdone(shot, &found.world_from_camera)?
+        {
+            doubt = Some(Doubt::Unlikely);
+        }
         if let Some(given) = (self.given)(number) {
             let object = FoundObject::of(shot, &found.world_from_camera, self.engine, self.model, 1)?;
             if object.bounds().is_none_or(|bounds| bounds.ends_inside(&given) > INSIDE) {
-                outcome.found.doubt = Some(Doubt::Inside);
+                doubt = Some(Doubt::Inside);
             }
         }
+        outcome.found.doubt = doubt.or(outcome.found.doubt);
         Ok(outcome)
     }
 

@@ -19,6 +19,8 @@ pub(super) const FINEST: f64 = 640.0;
 pub(super) const LIKELY: f32 = 17.0;
 /// Where less speaks for a pose that was found it is not to be trusted.
 pub(super) const TOLD: f32 = 16.0;
+/// Nor where, in a box, so many times as much speaks for the object from another side, or turned a little: for right poses it was 1.07 times at most, for most wrong ones it is more (`docs/tried.md`).
+const OUTDONE: f32 = 1.2;
 
 /// Two that have more than this part of both boxes in common are one.
 const SAME: f64 = 0.4;
@@ -206,6 +208,12 @@ impl<'a> Sightings<'a> {
         let at = self.place(shot, world_from_camera);
         let view = self.views_from(&[towards(world_from_camera, world_from_camera.w_axis.truncate().length())])?.remove(0);
         Ok(self.looked.judged(at, &self.template(&view)).evidence)
+    }
+
+    /// Whether so much more speaks for the object as it was sighted than for a pose that was found in a part of the photograph that this is hardly right.
+    pub(super) fn is_outdone(&self, shot: &Shot, world_from_camera: &DMat4) -> Result<bool, Error> {
+        let own = self.evidence(shot, world_from_camera)?;
+        Ok(self.matches.first().is_some_and(|likeliest| likeliest.evidence > OUTDONE * own))
     }
 
     /// What a pose that was found in a part of the photograph shows of the object there, and where it looks like it, up to how bright it is lit.
