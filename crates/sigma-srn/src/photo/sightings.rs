@@ -19,7 +19,7 @@ pub(super) const FINEST: f64 = 640.0;
 pub(super) const LIKELY: f32 = 17.0;
 /// Where less speaks for a pose that was found it is not to be trusted.
 pub(super) const TOLD: f32 = 16.0;
-/// Nor where, in a box, so many times as much speaks for the object from another side, or turned a little: for right poses it was 1.07 times at most, for most wrong ones it is more (`docs/tried.md`).
+/// Nor where, in a box, so many times as much speaks for the object from another side, or turned a little: for right ones it was 1.15 times at most, for most wrong ones it is more (`docs/tried.md`).
 const OUTDONE: f32 = 1.2;
 
 /// Two that have more than this part of both boxes in common are one.
