@@ -86,8 +86,10 @@ fn cut_out(photo: (&Photo, &Intrinsics), bounds: BoundingBox, known: Known, inst
     shot.ok_or_else(|| Error::Input { input: "box".into(), what: "empty".into() })
 }
 
+type Outcomes = Result<Vec<Outcome<()>>, Error>;
+
 /// Searches that all end where this one did.
-fn finding(found: &Found) -> impl FnMut(&[usize], Vec<Shot>, &[Vec<DMat4>]) -> Result<Vec<Outcome<()>>, Error> {
+fn finding(found: &Found) -> impl FnMut(&[usize], Vec<Shot>, &[Vec<DMat4>]) -> Outcomes {
     let outcome = |shot| Outcome { shot, found: found.clone(), log: () };
     move |_, shots, _| Ok(shots.into_iter().map(outcome).collect())
 }
