@@ -803,6 +803,8 @@ fn a_mask_takes_pixels_out_of_the_search() {
         let map = image.as_object_mut().unwrap();
         map.remove("seconds");
         map.remove("image");
+        // Rays that are cast decide in which order losses are added up: those of hypotheses that were left behind have another last digit on some processors.
+        map.remove("ranking");
         image
     };
     let [plain, other] = ["0156.png", "other/0156.png"].map(|image| found(image, "--mask masks --record pictures --force"));
@@ -1017,15 +1019,16 @@ fn a_box_in_the_first_frame_is_enough() {
     fail(dir, &format!("{track} --cutout masks"), &["--box", "--cutout"]);
     fail(dir, &format!("track frames --box 500,9,9,9 {args}"), &["0.png", "box 500,9,9,9"]);
 
-    // After some frames in which a hand is before all of it, it is found again where it was last seen for sure, or near that.
+    // After some frames in which a checked cloth is before all of it, it is found again where it was last seen for sure, or near that.
+    let cloth = |x: u32, y: u32| image::Rgb(if (x / 5 + y / 5).is_multiple_of(2) { [230, 60, 200] } else { [30, 190, 240] });
     fs::create_dir(dir.join("hidden")).unwrap();
     for k in 0..7 {
         let path = dir.join(format!("hidden/{k}.png"));
         on_a_table([50 + 3 * [0, 1, 1, 1, 1, 1, 2][k], 30], &path);
         if (2..6).contains(&k) {
             let mut picture = image::open(&path).unwrap().into_rgb8();
-            let is_hand = |x: u32, y: u32| (34 + k as u32..130).contains(&x) && y > 20;
-            picture.enumerate_pixels_mut().filter(|(x, y, _)| is_hand(*x, *y)).for_each(|(x, y, pixel)| *pixel = hand(x, y));
+            let is_cloth = |x: u32, y: u32| (34 + k as u32..130).contains(&x) && y > 20;
+            picture.enumerate_pixels_mut().filter(|(x, y, _)| is_cloth(*x, *y)).for_each(|(x, y, pixel)| *pixel = cloth(x, y));
             picture.save(&path).unwrap();
         }
     }
