@@ -347,8 +347,8 @@ fn adapt_fits_codes_then_networks() {
         let squares: f32 = before.iter().zip(other).map(|(a, b)| (a - b).powi(2)).sum();
         (squares / before.len() as f32).sqrt()
     };
-    // Networks that had learnt nothing but the seat would show it for every code.
-    assert!(off(&after) < 0.5 * off(&seat), "{} {}", off(&after), off(&seat));
+    // Networks that had learnt nothing but the seat would show it for every code. 0.26 times at most, on an EPYC without AVX-512.
+    assert!(off(&after) < 0.35 * off(&seat), "{} {}", off(&after), off(&seat));
 
     fail(&format!("{adapt} {}", new.display()), &["new.safetensors", "exists already"]);
     let other = at("other").display().to_string();
